@@ -27,6 +27,7 @@ from taisoft.output.tables import markdown
 from taisoft.view.colouring import background
 from taisoft.view.offscreen import Offscreen
 from taisoft.view.pictures import PictureOptions, PictureProcess, picture_writer
+from taisoft.view.sampling import Sampler
 from taisoft.view.shading import N_ATTRIBUTES, SAMPLES
 
 from .document import Limit, begin, check_out
@@ -45,7 +46,7 @@ class NumpyOffscreen(Offscreen):
 
     def image(self, sim) -> np.ndarray:
         """Return a picture of sim's present state, as `Offscreen.image` does."""
-        x, colours, lines = self._drawn(sim, self.size)
+        x, colours, lines = self._drawn(self.sampled(sim), self.size)
         attributes = np.column_stack([colours, np.zeros((len(x), N_ATTRIBUTES - 3))])
         points, triangles, attributes = self._triangles(x, attributes, lines)
         large = background((SAMPLES * self.size[0], SAMPLES * self.size[1]))
@@ -109,17 +110,21 @@ def timed_run(sim: ts.Simulator, seconds: float, where: str) -> dict[str, float]
     drawing: list[float] = []
     with tempfile.TemporaryDirectory() as folder:
         path, options = Path(folder), PictureOptions()
-        writer = PictureProcess(path, sim, options) if where == "with" else picture_writer(path, sim.scene, options, None)
+        sampler = Sampler(sim.scene)
+        writer = (PictureProcess if where == "with" else picture_writer)(path, sampler.drawn, options)
 
-        def on_frame(sim, index, _report) -> None:
-            drawing.append(timed(lambda: writer.frame(sim, index))["wall"])
+        def frame(index: int) -> None:
+            writer.frame(sampler.state(sim, options.layers, [options.colour]), index)
+
+        def on_frame(_sim, index, _report) -> None:
+            drawing.append(timed(lambda: frame(index))["wall"])
 
         def run() -> None:
             sim.run(seconds, on_frame, fps=PICTURES / seconds)
             drawing.append(timed(writer.flush)["wall"])
 
         with closing(writer):
-            writer.frame(sim, 0)
+            frame(0)
             writer.flush()
             one = timed(run)
     return one | {"drawing": sum(drawing)}

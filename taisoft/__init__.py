@@ -45,6 +45,7 @@ _MODULES = {  # public name -> the module that defines it
     "CollisionSettings": "taisoft.scene.collision",
     "Simulator": "taisoft.simulator",
     "Film": "taisoft.view.notebook",
+    "StoredRun": "taisoft.view.states",
     "InteractiveView": "taisoft.view.interactive",
     "LiveWindow": "taisoft.view.window",
     "show": "taisoft.view.window",

@@ -11,6 +11,7 @@ from taisoft.errors import SceneError, SimulationError
 from taisoft.fem.reference import gravity_mass, inverse_rest_edges, lumped_mass
 from taisoft.fem.terms import elasticity
 from taisoft.records import Energies, ErrorEstimate
+from taisoft.scene.look import Camera
 from taisoft.scene.obstacles import Obstacle
 from taisoft.scene.rigid import Pose, RigidBody, Twist
 from taisoft.stability import stable_dt as largest_stable_dt
@@ -256,17 +257,19 @@ def buffer_growths(self: "Simulator") -> dict[str, int]:
     return {name: n for name, n in detection.counts.growths.items() if n} if detection is not None else {}
 
 
-def picture(self: "Simulator", size: tuple[int, int] = (1280, 720), colour: str = "stress") -> np.ndarray:
+def picture(
+    self: "Simulator", size: tuple[int, int] = (1280, 720), colour: str = "stress", camera: Camera | None = None
+) -> np.ndarray:
     """Return a picture of the present state, uint8 (height, width, 3), first row on top.
 
     size: width and height in pixels; colour: of the bodies, by "stress" (von Mises), "stretch", "speed", contact "pressure" or
-    accumulated "slip", on a scale up to the state's 99 % quantile, "error" in a run with error=True, or "body". The camera frames
-    the bodies at the start, and steps back if one would leave the picture. Needs no display. Raises OutputError for another size
-    or colour.
+    accumulated "slip", on a scale up to the state's 99 % quantile, "error" in a run with error=True, or "body". camera: by
+    default the scene's own, else one that frames the bodies at the start, and steps back if one would leave the picture. Needs no
+    display. Raises OutputError for another size or colour.
     """
     from taisoft.view.offscreen import Offscreen  # compiles kernels at the first picture
 
-    return Offscreen(self.scene, size, colour=colour).image(self)
+    return Offscreen(self.scene, size, camera, colour).image(self)
 
 
 # --- arguments --------------------------------------------------------------------------------------------------------

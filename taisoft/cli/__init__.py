@@ -155,6 +155,14 @@ def command_parser() -> argparse.ArgumentParser:
     option("--out", metavar="FILE", required=True, help="the .toml file; its meshes are written beside it")
     option("--overwrite", action="store_true", help="replace existing files")
 
+    option = add("draw", ("draw", "draw"), "draw a finished run again in another look, without computing").add_argument
+    option("scene", metavar="DIR", help="folder of `taisoft run --out`")
+    option("--out", metavar="DIR", help="folder for the pictures (default: drawn in the run's)")
+    option("--overwrite", action="store_true", help="replace pictures already there")
+    _add_pictures(option, "colouring of bodies, by a quantity that the run has kept")
+    look = "NAME.colour='#rrggbb', NAME.opacity=NUMBER, or scene.background='#rrggbb'; may be repeated"
+    option("--set", action="append", default=[], dest="assignments", metavar="NAME.KEY=VALUE", help=look)
+
     _add_study(add)
     add("list", ("scene_file", "list_demos"), "the demos, one line each")
 
@@ -220,13 +228,12 @@ def _add_run(add) -> None:
     option("--resume", metavar="CHECKPOINT", help="continue a run of this scene from its checkpoint, until --seconds in total")
     every = "write DIR/checkpoint.npz every T of simulated time [s], not only at the end"
     option("--checkpoint-every", type=float, metavar="T", help=every)
-    option("--video", action="store_true", help="also make video.mp4 from the pictures with ffmpeg (extra 'video')")
-    option("--slow", type=float, metavar="FACTOR", help="film time over simulated time of video.mp4 (default 1)")
-    option("--size", metavar="WIDTHxHEIGHT", help="of the pictures in pixels (default 1280x720)")
-    directions = (
-        "direction of the pictures [deg]: about up from +z (with z up: -y) towards +x, and above the horizon (default 32 20)"
+    _add_pictures(option, "colouring of bodies in pictures and the window")
+    option(
+        "--keep",
+        metavar="NAME,...",
+        help="quantities kept by frame for `taisoft draw`, or none for no states (default stress,speed)",
     )
-    option("--view", type=float, nargs=2, metavar=("AZIMUTH", "ELEVATION"), help=directions)
     option("--vtu", action="store_true", help="also write every frame as a .vtu file, and scene.pvd, which ParaView opens")
     option("--no-usd", action="store_true", help="write no scene.usdc")
     quantity = "report a number at the end, with --error its error too: docs/errors.md lists the texts; may be repeated"
@@ -236,15 +243,28 @@ def _add_run(add) -> None:
     option("--about", type=float, nargs=3, metavar=("X", "Y", "Z"), help="point of torques [m] (default: centres of mass)")
     option("--error", action="store_true", help="estimate the error by runs with other steps and tolerances beside this one")
     option("--error-mesh", choices=("refined", "order"), help="also by one on another mesh; implies --error")
-    colours = ("body", "stress", "stretch", "speed", "pressure", "slip", "error")
-    option("--colour", choices=colours, default="body", help="colouring of bodies in pictures and the window")
-    layers = "what they show besides bodies: wires, contacts, tractions, pressures, connections, fibres, fixed_nodes, or none"
-    option("--layers", metavar="NAME,...", help=layers)
     plots = "on pictures: energies, residuals, iterations, contacts, step_time, error, forces, torques, kinetic, elastic"
     option("--plots", metavar="NAME,...", help=plots)
-    option("--caption", action="store_true", help="write scene, frame, time and energies on pictures")
     option("--no-frames", action="store_true", help="write no pictures")
     option("--verbose", action="store_true", help="print why each feature of the plan is on, and which are left out")
+
+
+def _add_pictures(option, colouring: str) -> None:
+    """Add the options of pictures and films, see `taisoft.cli.pictures`."""
+    option("--video", action="store_true", help="also make video.mp4 from the pictures with ffmpeg (extra 'video')")
+    option("--slow", type=float, metavar="FACTOR", help="film time over simulated time of video.mp4 (default 1)")
+    option("--size", metavar="WIDTHxHEIGHT", help="of the pictures in pixels (default 1280x720)")
+    directions = (
+        "direction of the pictures [deg]: about up from +z (with z up: -y) towards +x, and above the horizon (default 32 20)"
+    )
+    option("--view", type=float, nargs=2, metavar=("AZIMUTH", "ELEVATION"), help=directions)
+    camera = "a .toml file with a table [camera], or its keys, as in 'position = [3, 2, 4], target = [0, 0.5, 0], fov = 30'"
+    option("--camera", metavar="CAMERA", help=camera)
+    colours = ("body", "stress", "stretch", "speed", "pressure", "slip", "error")
+    option("--colour", choices=colours, default="body", help=colouring)
+    layers = "what they show besides bodies: wires, contacts, tractions, pressures, connections, fibres, fixed_nodes, or none"
+    option("--layers", metavar="NAME,...", help=layers)
+    option("--caption", action="store_true", help="write scene, frame, time and energies on pictures")
 
 
 def _add_placement(option, instead: str = "(default: the mesh stays)") -> None:

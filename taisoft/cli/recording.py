@@ -8,23 +8,23 @@ from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from taisoft.cli.pictures import names_of, picture_options, slowness
 from taisoft.details import DETAILS, QUANTITIES
-from taisoft.errors import OutputError, SceneError, reworded
+from taisoft.errors import OutputError, SceneError
 from taisoft.output.files import RESULT_FILES, RESULT_FOLDERS, CheckpointWriter, OutputFolder
 from taisoft.output.frame_files import VTU_NAME, VtuWriter, cut_pvd
 from taisoft.output.frame_table import FrameTable
-from taisoft.output.frames import FRAMES_NAME, FrameWriter, ffmpeg_command, find_ffmpeg, picture_numbers, write_video
+from taisoft.output.frames import FRAMES_NAME, ffmpeg_command, find_ffmpeg, picture_numbers, write_video
 from taisoft.output.report import body_records, write_report
 from taisoft.output.usd import UsdWriter
-from taisoft.output.viewpoint import MAX_ELEVATION
 from taisoft.records import RunReport
-from taisoft.scene import checks
-from taisoft.scene.checks import nearest
 from taisoft.view.annotations import text_missing
-from taisoft.view.offscreen import SIZE, checked_size
-from taisoft.view.pictures import PictureOptions, PictureProcess, open_pictures
+from taisoft.view.colouring import UNITS
+from taisoft.view.pictures import PictureOptions, open_pictures
 from taisoft.view.plots import PLOTS, Plots
-from taisoft.view.scene_view import IN_PICTURES, IN_WINDOW, LAYERS
+from taisoft.view.sampling import Sampler
+from taisoft.view.scene_view import IN_WINDOW, LAYERS
+from taisoft.view.states import KEPT, STATES_NAME, StateWriter
 
 NO_BALLS = "; nodes that follow a path have no balls, since it may release them"
 
@@ -33,7 +33,7 @@ NO_BALLS = "; nodes that follow a path have no balls, since it may release them"
 class DisplayOptions:
     """window, pictures, usd, vtu: whether there is a window, and what is written to the folder; layers: names, or None for the
     defaults; picture: what pictures show; errors: whether they are estimated. details: names, of steps.csv. slow: film time over
-    simulated time.
+    simulated time. keep: quantities of the states that are kept; None: no states.
     """
 
     window: bool
@@ -45,6 +45,7 @@ class DisplayOptions:
     errors: bool
     details: tuple[str, ...]
     slow: float
+    keep: tuple[str, ...] | None
 
     @property
     def in_window(self) -> tuple[str, ...]:
@@ -55,8 +56,9 @@ class DisplayOptions:
 def display_options(arguments: Namespace, has_window: bool) -> DisplayOptions:
     """Return the requested display options. Raises SceneError for unknown names and for options that nothing would show."""
     pictures = arguments.out is not None and not arguments.no_frames
-    layers, plots = _names("layers", arguments.layers, LAYERS), _names("plots", arguments.plots, PLOTS) or ()
-    details = _names("details", arguments.details, (*DETAILS, QUANTITIES)) or ()
+    layers, plots = names_of("layers", arguments.layers, LAYERS), names_of("plots", arguments.plots, PLOTS) or ()
+    details = names_of("details", arguments.details, (*DETAILS, QUANTITIES)) or ()
+    keep = names_of("keep", arguments.keep, [name for name in UNITS if name != "body"])
     requested = {"video": arguments.video, "caption": arguments.caption, "plots": bool(plots)}
     requested |= {"size": arguments.size is not None, "view": arguments.view is not None}
     if not has_window:
@@ -66,56 +68,17 @@ def display_options(arguments: Namespace, has_window: bool) -> DisplayOptions:
             raise SceneError(f"--{option} needs --out, the folder to write to, and pictures, so it excludes --no-frames")
     if arguments.about is not None and "pairs" not in details:
         raise SceneError("--about is the point of torques, so it needs --details pairs")
-    for option, given in {"vtu": arguments.vtu, "details": details}.items():
+    for option, given in {"vtu": arguments.vtu, "details": details, "keep": keep is not None}.items():
         if given and arguments.out is None:
             raise SceneError(f"--{option} needs --out, the folder to write to")
-    if pictures and (plots or arguments.caption) and text_missing():
-        raise SceneError(f"{'--plots' if plots else '--caption'}: {text_missing()}")
-    caption = Path(arguments.scene).stem if arguments.caption else None
     errors = arguments.error or arguments.error_mesh is not None
-    for option, given in {"colour": arguments.colour == "error", "plots": "error" in plots}.items():
+    of_error = {"colour": arguments.colour == "error", "plots": "error" in plots, "keep": "error" in (keep or ())}
+    for option, given in of_error.items():
         if given and not errors:
             raise SceneError(f"--{option} error needs --error")
-    if arguments.slow is not None and not arguments.video:
-        raise SceneError("--slow is the speed of the film, so it needs --video")
-    size = SIZE if arguments.size is None else _size_of(arguments.size)
-    slow = checks.number(1.0 if arguments.slow is None else arguments.slow, "--slow", above=0.0)
-    files = pictures, not arguments.no_usd, arguments.vtu
-    drawn = {"colour": arguments.colour, "layers": IN_PICTURES if layers is None else layers, "plots": plots, "caption": caption}
-    picture = PictureOptions(**drawn, size=size, view=_view_of(arguments.view))
-    return DisplayOptions(has_window, *files, layers, picture, errors, details, slow)
-
-
-def _view_of(angles: list[float] | None) -> tuple[float, float] | None:
-    """Return azimuth and elevation [deg]. Raises SceneError if they are not finite, or the view is from straight above."""
-    if angles is None:
-        return None
-    azimuth = checks.number(angles[0], "--view: azimuth")
-    elevation = checks.number(angles[1], "--view: elevation")
-    if abs(elevation) > MAX_ELEVATION:
-        raise SceneError(f"--view: the elevation must be from -{MAX_ELEVATION:g} to {MAX_ELEVATION:g} degrees, not {elevation:g}")
-    return azimuth, elevation
-
-
-def _size_of(text: str) -> tuple[int, int]:
-    """Return width and height [pixels] of a text such as 640x360. Raises SceneError."""
-    width, x, height = text.partition("x")
-    if not (x and width.isdecimal() and height.isdecimal()):
-        raise SceneError(f"--size {text}: write width and height in pixels, such as 640x360")
-    with reworded(OutputError, f"--size {text}: ", raised=SceneError):
-        return checked_size((int(width), int(height)))
-
-
-def _names(option: str, text: str | None, known) -> tuple[str, ...] | None:
-    """Return the comma-separated names in an option's value; `none` gives (), no value None. Raises SceneError."""
-    if text is None:
-        return None
-    names = tuple(name.strip() for name in text.split(",")) if text.strip() != "none" else ()
-    for name in names:
-        if name not in known:
-            hint = f"{nearest(name, known)}; there are {', '.join(known)}, and none"
-            raise SceneError(f"--{option} {text}: {name!r} is not a valid name{hint}")
-    return names
+    files, slow, picture = (pictures, not arguments.no_usd, arguments.vtu), slowness(arguments), picture_options(arguments, plots)
+    keep = KEPT if keep is None else keep if arguments.keep.strip() != "none" else None
+    return DisplayOptions(has_window, *files, layers, picture, errors, details, slow, keep)
 
 
 def check_modelled(shown: DisplayOptions, sim) -> None:
@@ -149,7 +112,7 @@ class Observers:
                 self.guard(member.frame, sim, index)
             seconds = time.perf_counter() - start - (sim.compile_seconds - compiled)
             self.seconds += seconds
-            self.picture_seconds += seconds if isinstance(member, (FrameWriter, PictureProcess)) else 0.0
+            self.picture_seconds += seconds if isinstance(member, StateWriter) else 0.0
 
     def close(self) -> None:
         """Close all members, last first, even if some fail."""
@@ -170,7 +133,7 @@ class Observers:
 
 
 class Recording:
-    """Results of a run in one folder: report.json, steps.csv, checkpoint.npz and, if requested, pictures, USD and .vtu.
+    """Results of a run in one folder: report.json, steps.csv, checkpoint.npz and, if requested, states, pictures, USD and .vtu.
 
     resumed: for a resumed run, the `checkpoint`, its `time` [s] and the first `frame`; earlier results in the folder are
     continued. every: simulated time between two checkpoints [s]; None for one at the end. notes: those of the checkpoint of
@@ -209,36 +172,27 @@ class Recording:
             self._folder.clear(self._first)
         if shown.vtu:
             observers.members.append(VtuWriter(folder, sim.scene, self._first or 0, shown.errors))
-        pictures = None
+        sampler, pictures = Sampler(sim.scene), None
         if shown.pictures:
             n_pictures = round((seconds - (0.0 if self._resumed is None else self._resumed["time"])) * (fps or 1.0 / sim.dt))
-            pictures = open_pictures(folder, sim, self._picture_options(shown.picture), plots, n_pictures)
-            observers.members.append(pictures)
+            options = replace(shown.picture, bar=has_bar(shown.picture.colour), kept=self._notes)
+            pictures = open_pictures(folder, sampler.drawn, options, plots, n_pictures)
             self._checkpoints.before.append(pictures.flush)
+        if pictures is not None or shown.keep is not None:
+            members, looks = [] if pictures is None else [pictures], (shown.picture.layers, shown.picture.colour)
+            states = StateWriter(folder, sampler, shown.keep, members, looks)
+            observers.members.append(states)
+            self._checkpoints.before.append(states.flush)
         self._checkpoints.notes = lambda: {"fps": fps} | (pictures.kept(sim.time) if pictures else {})
         observers.members.append(self._checkpoints)
-
-    def _picture_options(self, picture: PictureOptions) -> PictureOptions:
-        has_scale = picture.colour != "body"
-        no_bar = has_scale and text_missing()
-        if no_bar:
-            print(f"taisoft: pictures have no colour bar: {no_bar}", file=sys.stderr)
-        return replace(picture, bar=has_scale and not no_bar, kept=self._notes)
 
     def checkpoint(self, sim) -> None:
         """Write checkpoint.npz. Raises OutputError."""
         self._checkpoints.write(sim)
 
     def video(self, fps: float) -> None:
-        """Write video.mp4 from the pictures, or print the command if ffmpeg is missing. Raises OutputError."""
-        folder = self._folder.path
-        if not picture_numbers(folder):
-            return
-        if find_ffmpeg() is None:
-            line = shlex.join(ffmpeg_command(folder, fps))
-            print(f"taisoft: no video without ffmpeg (pip install 'taisoft[video]'); the command is: {line}", file=sys.stderr)
-            return
-        write_video(folder, fps)
+        """Write video.mp4 from the pictures, as `make_video`. Raises OutputError."""
+        make_video(self._folder.path, fps)
 
     def report(self, result: RunReport, sim, settings: dict) -> None:
         """Write report.json and steps.csv, and remove files left by an earlier run. Raises OutputError."""
@@ -260,7 +214,7 @@ class Recording:
         """Return the contents of the folder: one text per file, and one for each folder of frames."""
         paths = [path for path in (self.path / name for name in RESULT_FILES) if path.is_file()]
         found = [f"{path} ({_size([path])})" for path in paths]
-        for name, what in ((FRAMES_NAME, "pictures"), (VTU_NAME, "files")):
+        for name, what in ((FRAMES_NAME, "pictures"), (VTU_NAME, "files"), (STATES_NAME, "files")):
             if files := list((self.path / name).glob(RESULT_FOLDERS[name])):
                 found.append(f"{self.path / name}/ ({len(files)} {what}, {_size(files)})")
         return found
@@ -268,6 +222,25 @@ class Recording:
     def close(self) -> None:
         """Release the folder."""
         self._folder.close()
+
+
+def has_bar(colour: str) -> bool:
+    """Return whether pictures have a colour bar; print why not if text cannot be drawn."""
+    missing = colour != "body" and text_missing()
+    if missing:
+        print(f"taisoft: pictures have no colour bar: {missing}", file=sys.stderr)
+    return colour != "body" and not missing
+
+
+def make_video(folder: Path, fps: float) -> None:
+    """Write folder/video.mp4 from the pictures, or print the command if ffmpeg is missing. Raises OutputError."""
+    if not picture_numbers(folder):
+        return
+    if find_ffmpeg() is None:
+        line = shlex.join(ffmpeg_command(folder, fps))
+        print(f"taisoft: no video without ffmpeg (pip install 'taisoft[video]'); the command is: {line}", file=sys.stderr)
+        return
+    write_video(folder, fps)
 
 
 def _size(paths: list[Path]) -> str:

@@ -16,6 +16,7 @@ import numpy as np
 
 from taisoft.checkpoint import Checkpoint, read_checkpoint
 from taisoft.cli import EXIT_FAILED, EXIT_OUTPUT, EXIT_SIGNAL, Signals, parse_scalar, printed_warnings
+from taisoft.cli.pictures import camera_of
 from taisoft.cli.recording import DisplayOptions, Observers, Recording, check_modelled, display_options
 from taisoft.cli.scene_file import OF_SCENE, load_scene, refuse_unknown
 from taisoft.cli.summary import print_plan, print_state, print_summary
@@ -70,6 +71,8 @@ def run(arguments: Namespace) -> int:
     _check_working_folder()
     with Signals() as signals, printed_warnings() as warned:
         scene, solver = load_scene(arguments.scene, arguments.allow_outside)
+        if arguments.camera is not None:
+            scene.camera = camera_of(arguments.camera)
         numbers = set_given(scene, arguments.assignments)
         warn_millimetres({body.name: body.mesh for body in scene.bodies})
         _check_checkpoint_interval(arguments)

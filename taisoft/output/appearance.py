@@ -67,20 +67,19 @@ def subdivide(points: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np
 class ShownBodies:
     """What is shown of the bodies: the surface that touches, whose vertices are nodes, or a skin that only rides along.
 
-    surfaces: (rest (v,3) [m], triangles (t,3)) of each body; starts: (n_bodies + 1,) its first shown vertex.
+    scene: a `taisoft.view.drawn.DrawnScene`; surfaces: (rest (v,3) [m], triangles (t,3)) of each body; starts: (n_bodies + 1,)
+    its first shown vertex.
     """
 
     def __init__(self, scene):
-        riding = [body.riding_skin for body in scene.bodies]
         self.surfaces = [
-            (body.rest_positions, body.nodes.surface) if skin is None else (skin.surface.vertices, skin.surface.triangles)
-            for body, skin in zip(scene.bodies, riding)
+            (body.rest_positions, body.surface) if body.weights is None else (body.vertices, body.triangles)
+            for body in scene.bodies
         ]
         self.starts = np.cumsum([0, *(len(rest) for rest, _ in self.surfaces)])
         self.matrix: sp.csr_matrix | None = None  # (shown vertices, nodes); None: they are the same
-        if any(riding):
-            parts = zip(scene.bodies, riding)
-            own = [sp.identity(body.n_nodes) if skin is None else skin.weights for body, skin in parts]
+        if any(body.weights is not None for body in scene.bodies):
+            own = [sp.identity(body.n_nodes) if body.weights is None else body.weights for body in scene.bodies]
             self.matrix = sp.block_diag(own, format="csr")
 
     def of(self, values: np.ndarray) -> np.ndarray:
@@ -102,7 +101,10 @@ class ObstacleSurface:
     def at(self, t: float) -> np.ndarray:
         """Return the vertices (n,3) [m] at time t [s]. Raises OutputError if the obstacle's path fails."""
         with reworded(SceneError, "an obstacle cannot be shown: ", raised=OutputError):
-            translation, rotation = self.obstacle.pose(t)
+            return self.placed(*self.obstacle.pose(t))
+
+    def placed(self, translation: np.ndarray, rotation: np.ndarray) -> np.ndarray:
+        """Return the vertices (n,3) [m] of the obstacle at a pose."""
         shape = self.obstacle.shape
         pivot, at = shape.pivot, shape.pivot + translation
         if isinstance(shape, HalfSpace) and self.obstacle.path is not None:

@@ -20,7 +20,7 @@ REPORT_FILES = ("report.json", "steps.csv", PVD_NAME)  # removed at once: beside
 # Left by a killed writer: see `taisoft.files.part_path`; USD adds temporary files with a suffix of its own
 TEMPORARY = re.compile(r"\.\d+-\d+\.part$|\.usdc\.\d+-\d+\.[A-Za-z0-9]{6}$")
 # folder -> pattern of a run's files in it, one for each frame or chunk of frames
-RESULT_FOLDERS = {"frames": "[0-9]*.png", "chunks": "points_*.usdc", "vtu": "[0-9]*.vtu"}
+RESULT_FOLDERS = {"frames": "[0-9]*.png", "chunks": "points_*.usdc", "vtu": "[0-9]*.vtu", "states": "*.npz"}
 
 
 @contextmanager

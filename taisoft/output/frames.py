@@ -29,8 +29,8 @@ ENCODING = "-c:v libx264 -crf 18 -pix_fmt yuv420p -vf pad=ceil(iw/2)*2:ceil(ih/2
 class FrameWriter:
     """Observer that writes folder/frames/<index>.png, in a thread, so that the simulation goes on meanwhile.
 
-    folder: the run's folder; renderer: an object with `image(sim) -> uint8 (height, width, 3)` and `close()`, such as
-    `taisoft.view.offscreen.Offscreen`, which is closed with this writer; annotate: (picture, sim, index) -> picture to write.
+    folder: the run's folder; renderer: an object with `image(state) -> uint8 (height, width, 3)` and `close()`, such as
+    `taisoft.view.offscreen.Offscreen`, which is closed with this writer; annotate: (picture, state, index) -> picture to write.
     At most WAITING pictures wait; then `frame` waits too. A picture that cannot be written, for whatever reason, raises
     OutputError at the next `frame`, `flush` or `close`; later ones are not written. Raises OutputError.
     """
@@ -43,14 +43,14 @@ class FrameWriter:
         self._thread = threading.Thread(target=self._write_all, name="pictures", daemon=True)  # an exit does not wait for it
         self._thread.start()
 
-    def frame(self, sim, index: int) -> None:
-        """Draw sim's present state, to be written as picture number index. Raises OutputError."""
+    def frame(self, state, index: int) -> None:
+        """Draw a state, to be written as picture number index. Raises OutputError."""
         if not self._thread.is_alive():
             raise OutputError(f"picture {index} cannot be written to {self.folder}: its writer is closed")
         self._raise()
-        picture = self.renderer.image(sim)
+        picture = self.renderer.image(state)
         if self._annotate is not None:
-            picture = self._annotate(picture, sim, index)
+            picture = self._annotate(picture, state, index)
         self._waiting.put((self.folder / f"{index:05d}.png", picture))
 
     def flush(self) -> None:

@@ -20,6 +20,7 @@ from typing import TextIO
 
 import numpy as np
 
+from taisoft.errors import OutputError, reason
 from taisoft.files import write_bytes
 from taisoft.machine import processor
 from taisoft.machine import versions as installed
@@ -29,6 +30,16 @@ PACKAGES = ("taichi", "numpy", "scipy", "usd-core")
 LINE_EVERY = 5.0  # time between lines of progress if the stream is not a terminal [s]
 COLUMNS = [f.name for f in dataclasses.fields(StepReport) if f.name != "details"]
 NUMERIC = [f.name for f in dataclasses.fields(StepReport) if f.type in (int, float) and f.name != "time"]
+
+
+def frame_rate(folder: str | Path) -> float:
+    """Return the frames per second of simulated time [1/s] of a run in a folder. Raises OutputError."""
+    path = Path(folder) / "report.json"
+    try:
+        settings = json.loads(path.read_text(encoding="utf-8"))["settings"]
+        return float(settings["fps"] or 1.0 / settings["dt"])
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise OutputError(f"{path}: the frame rate of the run cannot be read: {reason(error)}") from None
 
 
 def write_report(folder: str | Path, result: RunReport, *, resumed: dict | None = None, **entries) -> None:

@@ -60,6 +60,12 @@ def lights_of(value) -> "tuple[Light, ...] | None":
     return lights
 
 
+def check_follow(camera: "Camera | None", bodies) -> None:
+    """Raise SceneError if a camera follows none of the bodies."""
+    if camera is not None and camera.follow is not None:
+        checks.index(camera.follow, [body.name for body in bodies], "camera: follow: no body")
+
+
 @guarded_record("light", "make a new Light")
 @dataclass(frozen=True, eq=False)
 class Light:
@@ -128,16 +134,14 @@ class Camera:
 
         up: the scene's. The angles are those of `taisoft.output.viewpoint.Viewpoint`.
         """
-        up = self.up or up
-        x, y, z = (np.atleast_2d(self.position - self.target) @ FROM_Y_UP[up]).T
+        up, k = self.up or up, 1 if self.times is None else len(self.times)
+        x, y, z = (np.broadcast_to(self.position - self.target, (k, 3)) @ FROM_Y_UP[up]).T
         level = np.hypot(x, z)
-        turn = np.unwrap(np.arctan2(x, z))
-        target, fov = np.broadcast_to(self.target, (len(x), 3)), np.broadcast_to(self.fov, len(x))
-        slope = np.log(np.tan(np.radians(fov) / 2.0))
-        keys = np.column_stack([target, np.log(np.hypot(level, y)), turn, np.arctan2(y, level), slope])
-        if self.times is None or len(self.times) == 1:
-            row = keys[0]
-        else:
+        angles = np.unwrap(np.arctan2(x, z)), np.arctan2(y, level)
+        slope = np.broadcast_to(np.log(np.tan(np.radians(self.fov) / 2.0)), k)
+        keys = np.column_stack([np.broadcast_to(self.target, (k, 3)), np.log(np.hypot(level, y)), *angles, slope])
+        row = keys[0]
+        if k > 1:
             row = scipy.interpolate.PchipInterpolator(self.times, keys)(np.clip(t, self.times[0], self.times[-1]))
         angles = {"azimuth": math.degrees(row[4]), "elevation": math.degrees(row[5])}
         fov = 2.0 * math.degrees(math.atan(math.exp(row[6])))

@@ -23,7 +23,7 @@ from taisoft.scene.connection_records import Attachment, Connection, Spring, Ten
 from taisoft.scene.connections import add_spring, add_tendon, attach, attached_pairs, check_connections, constraint_of
 from taisoft.scene.curves import Curve
 from taisoft.scene.loads import Cavity
-from taisoft.scene.look import Camera, background_of, lights_of
+from taisoft.scene.look import Camera, background_of, check_follow, lights_of
 from taisoft.scene.material import Material
 from taisoft.scene.obstacles import HalfSpace, Obstacle, Shape, surface_numbers
 from taisoft.scene.rigid import RigidBody
@@ -184,8 +184,7 @@ class Scene(Guarded):
                 if cavity.name in names:
                     raise SceneError(f"body {body.name!r}: cavity name {cavity.name!r} is taken; names must be unique")
                 names.add(cavity.name)
-        if self.camera is not None and self.camera.follow is not None:
-            checks.index(self.camera.follow, [body.name for body in self.bodies], "camera: follow: no body")
+        check_follow(self.camera, self.bodies)
         check_connections(self)
 
     @property

@@ -14,7 +14,8 @@ import numpy as np
 
 from taisoft.errors import OutputError
 from taisoft.view.colouring import TITLES, UNITS, Colouring, colours_of
-from taisoft.view.plots import ENERGIES, Curves, PlotChoice
+from taisoft.view.drawn import DrawnState
+from taisoft.view.plots import Curves, PlotChoice
 
 HEIGHT = 720.0  # of the picture that lengths refer to
 MARGIN, WIDTH = 16, 300  # of the plots
@@ -53,8 +54,8 @@ class Annotations:
         self._bar: tuple | None = None  # what it shows, and its layer
         self._font_file = Path(matplotlib.get_data_path()) / "fonts/ttf/DejaVuSans.ttf"
 
-    def draw(self, picture: np.ndarray, sim, index: int) -> np.ndarray:
-        """Return an annotated copy of a picture, uint8 (height, width, 3), of sim's present state; index: frame number."""
+    def draw(self, picture: np.ndarray, state: DrawnState, index: int) -> np.ndarray:
+        """Return an annotated copy of a picture, uint8 (height, width, 3), of a state; index: frame number."""
         height, width = picture.shape[:2]
         self._unit = SAMPLES * height / HEIGHT  # drawn pixels per unit of length
         size = width * HEIGHT / height, HEIGHT
@@ -66,7 +67,7 @@ class Annotations:
         caption = size[1] - CAPTION_HEIGHT if self._name is not None else size[1] - MARGIN
         if self._name is not None:
             with self._overlay(result, (0.0, caption, size[0] - WIDTH * bool(names), size[1])):
-                self._draw_caption(sim, index, size)
+                self._draw_caption(state, index, size)
         legend = self._colouring.legend() if self._colouring is not None else []
         if legend:
             box = (0.0, caption - BAR_HEIGHT, 2 * MARGIN + BAR[0], caption)
@@ -154,11 +155,10 @@ class Annotations:
 
     # --- caption ------------------------------------------------------------------------------------------------------
 
-    def _draw_caption(self, sim, index: int, size: tuple[float, float]) -> None:
-        energies = sim.energies()
+    def _draw_caption(self, state: DrawnState, index: int, size: tuple[float, float]) -> None:
         bottom = size[1] - MARGIN
-        text = "   ".join(f"{name} {getattr(energies, name):.4g} J" for name in ENERGIES)
-        self._write(MARGIN, bottom, f"frame {index}   t = {sim.time:.4f} s   {text}", TEXT_SIZE, INK, anchor="lb", halo=True)
+        text = "   ".join(f"{name} {energy:.4g} J" for name, energy in state.energies.items())
+        self._write(MARGIN, bottom, f"frame {index}   t = {state.time:.4f} s   {text}", TEXT_SIZE, INK, anchor="lb", halo=True)
         self._write(MARGIN, bottom - TEXT_SIZE - 8, self._name, TITLE_SIZE, INK, anchor="lb", halo=True)
 
     def _draw_colour_bar(self, legend: list[tuple[str, np.ndarray]], bottom: float) -> None:

@@ -11,17 +11,13 @@ silhouettes. The lamps move with the camera, so that every view is lit alike.
 """
 
 import math
-from collections.abc import Callable
-from functools import cached_property
 
 import numpy as np
 
 from taisoft.errors import OutputError
-from taisoft.fem.reference import inverse_rest_edges
 from taisoft.mesh.placing import UP
-from taisoft.output.nodal_fields import NodalMean, surface_values, von_mises
 from taisoft.output.viewpoint import Viewpoint
-from taisoft.scene.rigid import RigidBody
+from taisoft.view.drawn import DrawnState
 
 UNITS = {"body": "", "stress": "Pa", "stretch": "", "speed": "m/s", "pressure": "Pa", "slip": "m", "error": "m"}
 TITLES = {
@@ -36,7 +32,7 @@ TITLES = {
 QUANTILE = 0.99  # fraction of the nodes whose values lie within the scale
 DECAY = 0.998  # factor on the running maximum per picture
 LOWER_MARGIN = 1.5  # the end is lowered once this times the running maximum, rounded up, is below it
-OF_CONTACTS = {"pressure": "pressure", "slip": "accumulated_slip"}  # quantity -> field of `ContactPressure`
+POSITIVE = ("pressure", "slip")  # of which nodes without any do not count
 # smallest span of the scale, for a scene at rest
 MIN_SPAN = {"stress": 1.0, "stretch": 1e-3, "speed": 1e-3, "pressure": 1.0, "slip": 1e-12, "error": 1e-12}
 # sRGB, from low to high
@@ -56,49 +52,11 @@ def checked_colour(kind: str) -> str:
     return kind
 
 
-class NodalValues:
-    """A quantity at the nodes of all bodies. bodies: of the scene, in the order added."""
-
-    def __init__(self, bodies):
-        self._bodies = bodies
-        self._rigid = np.concatenate([np.full(body.n_nodes, isinstance(body, RigidBody)) for body in bodies])
-
-    def __call__(self, kind: str, sim) -> np.ndarray:
-        """Return the quantity, one of UNITS but "body", at all nodes (n_nodes,) in sim's present state."""
-        if kind == "stress":
-            return np.where(self._rigid, np.nan, von_mises(self._mean(sim.stress())))  # a rigid body's tet is not its material
-        if kind == "error":
-            return sim.nodal_errors()
-        if kind in OF_CONTACTS:
-            return surface_values(sim, OF_CONTACTS[kind])[0]
-        return self._mean(self._stretches(sim)) if kind == "stretch" else np.linalg.norm(sim.velocities(), axis=1)
-
-    @cached_property
-    def _mean(self) -> NodalMean:
-        return NodalMean(self._bodies)
-
-    @cached_property
-    def _Dm_inv(self) -> list[np.ndarray]:
-        return [inverse_rest_edges(b.mesh.vertices, b.mesh.tets)[0] for b in self._bodies]
-
-    def _stretches(self, sim) -> np.ndarray:
-        """Return the largest principal stretch of every tet (m,); for quadratic tets that of the linear tet of the corners."""
-        parts = []
-        for body, Dm_inv in zip(self._bodies, self._Dm_inv):
-            corner = sim.positions(body.name)[body.mesh.tets]
-            F = (corner[:, 1:] - corner[:, :1]).transpose(0, 2, 1) @ Dm_inv
-            parts.append(np.sqrt(np.linalg.eigvalsh(F.transpose(0, 2, 1) @ F)[:, 2]))
-        return np.concatenate(parts)
-
-
 class Colouring:
-    """Unshaded colours of the drawn vertices of `Surfaces`, by one of UNITS. Raises OutputError for another name.
+    """Unshaded colours of the drawn vertices of `Surfaces`, by one of UNITS. Raises OutputError for another name."""
 
-    values: called with the quantity and sim, returns it at all nodes (n_nodes,), or None as long as it is not known.
-    """
-
-    def __init__(self, scene, surfaces, kind: str = "body", values: Callable | None = None):
-        self._surfaces, self.values = surfaces, values or NodalValues(scene.bodies)
+    def __init__(self, surfaces, kind: str = "body"):
+        self._surfaces = surfaces
         self._has_errors = kind == "error"
         self.choose(kind)
 
@@ -126,13 +84,12 @@ class Colouring:
         """Lower end of the scale."""
         return 1.0 if self.kind == "stretch" else 0.0
 
-    def base(self, sim) -> np.ndarray:
-        """Return unshaded colours (n,3) of all drawn vertices, sRGB."""
-        values = None if self.kind == "body" else self.values(self.kind, sim)
-        if values is None:
+    def base(self, state: DrawnState) -> np.ndarray:
+        """Return unshaded colours (n,3) of all drawn vertices, sRGB; the bodies' own as long as the quantity is not known."""
+        if self.kind not in state.values:
             return self._surfaces.colours
-        above = values - self.low
-        finite = above[np.isfinite(above) & ((above > 0.0) | (self.kind not in OF_CONTACTS))]
+        above = state.values[self.kind].astype(np.float64) - self.low
+        finite = above[np.isfinite(above) & ((above > 0.0) | (self.kind not in POSITIVE))]
         value = float(np.quantile(finite, QUANTILE)) if len(finite) else 0.0
         self._peak = max(value, DECAY * self._peak, MIN_SPAN[self.kind])
         if self._peak > self.span or round_up(LOWER_MARGIN * self._peak) < self.span:

@@ -14,11 +14,12 @@ import numpy as np
 import rich
 
 from taisoft.errors import OutputError
-from taisoft.output.appearance import OBSTACLE_COLOUR, compact_surface, linear_rgb, obstacle_surfaces
-from taisoft.output.viewpoint import Viewpoint, framed_points
+from taisoft.output.appearance import compact_surface, linear_rgb, obstacle_colour, obstacle_surfaces
+from taisoft.output.viewpoint import Viewpoint, camera_viewpoint
 from taisoft.scene.obstacles import HalfSpace
 from taisoft.view.colouring import Colouring
 from taisoft.view.notebook import FramesOnPage
+from taisoft.view.sampling import Sampler
 from taisoft.view.scene_view import Surfaces
 
 HEIGHT = 420  # of the view in a notebook [pixels]
@@ -55,12 +56,14 @@ class InteractiveView(FramesOnPage):
     def __call__(self, sim, _index: int = 0, _report=None) -> None:
         """Add sim's present state. Raises OutputError if it has another scene than the first frame."""
         if self._scene is None:
-            self._scene, self._surfaces, self._obstacles = sim.scene, Surfaces(sim.scene), obstacle_surfaces(sim.scene)
+            self._scene, self._sampler, self._obstacles = sim.scene, Sampler(sim.scene), obstacle_surfaces(sim.scene)
+            self._surfaces = Surfaces(self._sampler.drawn)
             self._used, self._faces = compact_surface(self._surfaces.body_triangles)
-            self._colouring = Colouring(sim.scene, self._surfaces, self.colour)
+            self._colouring = Colouring(self._surfaces, self.colour)
         if sim.scene is not self._scene:
             raise OutputError("an interactive view shows one scene: make another one for another simulator")
-        x, colours = self._surfaces.of_bodies(sim)[0], linear_rgb(self._colouring.base(sim))
+        state = self._sampler.state(sim, kinds=[self.colour])
+        x, colours = self._surfaces.of_bodies(state)[0], linear_rgb(self._colouring.base(state))
         self._frames.append((x[self._used].astype(np.float32), np.round(255 * colours[self._used]).astype(np.uint8)))
         moving = ((number, one) for number, one in enumerate(self._obstacles) if one.obstacle.path is not None)
         self._moved.append({number: one.at(sim.time).astype(np.float32) for number, one in moving})
@@ -94,7 +97,8 @@ class InteractiveView(FramesOnPage):
         """
         import trimesh
 
-        camera = Viewpoint.framing(framed_points(self._scene), up=self._scene.up)
+        drawn = self._sampler.drawn
+        camera = camera_viewpoint(drawn, self.times[0], drawn.start) or Viewpoint.framing(drawn.framed, up=drawn.up)
         server.scene.set_up_direction(f"+{self._scene.up}")
         server.initial_camera.position, server.initial_camera.look_at = tuple(camera.position), tuple(camera.target)
         server.initial_camera.fov = math.radians(camera.fov)
@@ -111,13 +115,13 @@ class InteractiveView(FramesOnPage):
 
     def _add_obstacles(self, server) -> dict[int, object]:
         """Put the obstacles on a server at the first frame's time; return the handles of those that have triangles, by number."""
-        grey = tuple(np.round(255 * OBSTACLE_COLOUR).astype(int).tolist())
         handles = {}
         for number, surface in enumerate(self._obstacles):
             if len(surface.triangles) == 0:
                 continue
             x, faces = self._moved[0].get(number, surface.vertices.astype(np.float32)), surface.triangles.astype(np.uint32)
             side = "front" if isinstance(surface.obstacle.shape, HalfSpace) else "double"  # walls do not hide what they hold
+            grey = tuple(np.round(255 * obstacle_colour(surface.obstacle)).astype(int).tolist())
             added = server.scene.add_mesh_simple(f"/obstacles/{number}", x, faces, color=grey, flat_shading=True, side=side)
             handles[number] = added
         return handles

@@ -1,8 +1,8 @@
 """The link between a simulation and the process that shows it: small messages over a socket, node data in shared memory.
 
-A message is a dict of plain data and arrays in JSON (`taisoft.nested`); nothing is pickled. Positions and values at the nodes,
-which may be large, lie in memory that both processes map, in one or several slots. The writer fills a slot only after the reader
-has confirmed the message about its previous content, so sending rarely waits for the reader.
+A message is a dict of plain data and arrays in JSON (`taisoft.nested`); nothing is pickled. Displacements and values at the
+nodes, which may be large, lie in memory that both processes map, in one or several slots. The writer fills a slot only after the
+reader has confirmed the message about its previous content, so sending rarely waits for the reader.
 """
 
 import mmap
@@ -14,6 +14,7 @@ from multiprocessing.connection import Connection
 import numpy as np
 
 from taisoft.nested import from_json, to_json
+from taisoft.view.drawn import DrawnScene, DrawnState
 
 
 class LinkClosed(Exception):
@@ -21,16 +22,29 @@ class LinkClosed(Exception):
 
 
 class SharedNodes:
-    """Positions x (slots,n,3) [m] and values (slots,n) at all nodes, in memory that is shared through a file descriptor."""
+    """Displacements (slots,n,3) [m] and values (slots,n) at all nodes, float32, in memory shared through a file descriptor."""
 
     def __init__(self, n_nodes: int, slots: int = 1, descriptor: int | None = None):
-        size = max(1, n_nodes) * slots * 4 * 8
+        size = max(1, n_nodes) * slots * 4 * 4
         if descriptor is None:
             descriptor = _anonymous_file()
             os.ftruncate(descriptor, size)
         self.descriptor, self._memory = descriptor, mmap.mmap(descriptor, size)
-        parts = np.frombuffer(self._memory, np.float64, 4 * slots * n_nodes).reshape(4, slots, n_nodes)
-        self.x, self.values = parts[:3].reshape(slots, n_nodes, 3), parts[3]
+        parts = np.frombuffer(self._memory, np.float32, 4 * slots * n_nodes).reshape(4, slots, n_nodes)
+        self.displacement, self.values = parts[:3].reshape(slots, n_nodes, 3), parts[3]
+
+    def put(self, state: DrawnState, kind: str, slot: int = 0) -> dict:
+        """Fill a slot from a state, with the values of one quantity; return the rest as plain data."""
+        self.displacement[slot] = state.displacement
+        if kind in state.values:
+            self.values[slot] = state.values[kind]
+        return state.plain() | {"kind": kind}
+
+    def take(self, scene: DrawnScene, rest: dict, slot: int = 0) -> DrawnState:
+        """Return a copy of the state that was put into a slot. rest: what `put` returned."""
+        kind, rest = rest["kind"], {name: value for name, value in rest.items() if name != "kind"}
+        values = {} if kind == "body" else {kind: self.values[slot].copy()}
+        return DrawnState(scene, displacement=self.displacement[slot].copy(), values=values, **rest)
 
     def close(self) -> None:
         """Close the descriptor; the memory goes with its last array."""

@@ -9,8 +9,10 @@ from taisoft.display import caption
 from taisoft.errors import OutputError
 from taisoft.files import write_bytes
 from taisoft.output.frames import FRAMES_NAME, png_bytes
-from taisoft.output.viewpoint import start_positions
+from taisoft.output.report import frame_rate
+from taisoft.scene.look import Camera
 from taisoft.view.colouring import checked_colour
+from taisoft.view.drawn import DrawnState
 from taisoft.view.offscreen import Offscreen, checked_size
 
 SIZE = (640, 360)  # of pictures in notebooks [pixels]
@@ -18,34 +20,21 @@ COMPRESSION = 6  # of their PNGs, which notebooks store
 MAX_NODES = 200_000  # of a scene or a simulator that is drawn when it is displayed
 
 
-class AtStart:
-    """What a picture needs of a simulator, of a scene at its start, without one."""
-
-    time = 0.0
-
-    def __init__(self, scene):
-        self.scene = scene
-
-    def positions(self):
-        """Positions of the nodes of all bodies at the start (n,3) [m]."""
-        return start_positions(self.scene)
-
-
 def scene_html(scene) -> str | None:
     """Return a picture of a scene at its start, and its repr; None without bodies or above MAX_NODES."""
-    return _html(AtStart(scene), "body", scene) if scene.bodies else None
+    return _html(scene, None, "body", scene) if scene.bodies else None
 
 
 def simulator_html(sim) -> str | None:
     """Return a picture of a simulator's state, coloured by stress, and its repr; None if it is closed, or above MAX_NODES."""
-    return _html(sim, "stress", sim) if sim.is_open else None
+    return _html(sim.scene, sim, "stress", sim) if sim.is_open else None
 
 
-def _html(sim, colour: str, thing) -> str | None:
-    if sum(body.n_nodes for body in sim.scene.bodies) > MAX_NODES:
+def _html(scene, sim, colour: str, thing) -> str | None:
+    if sum(body.n_nodes for body in scene.bodies) > MAX_NODES:
         return None
-    drawing = Offscreen(sim.scene, SIZE, colour=colour)
-    png = png_bytes(drawing.image(sim), COMPRESSION)
+    drawing = Offscreen(scene, SIZE, colour=colour)
+    png = png_bytes(drawing.image(DrawnState.at_start(drawing.scene) if sim is None else sim), COMPRESSION)
     scale = f"; {drawing.colouring.scale_text}" if colour != "body" else ""
     return f'<img src="{_data_url(png)}" width="{SIZE[0]}" height="{SIZE[1]}"/>{caption(repr(thing) + scale)}'
 
@@ -103,13 +92,14 @@ class Film(FramesOnPage):
     """Pictures of a run, and a player for them in notebooks and static pages.
 
     `sim.run(seconds, on_frame=film)` adds a picture a frame; `film(sim)` adds one of the present state. size: width and height in
-    pixels; colour: as for `Simulator.picture`, on one scale for all pictures. Raises OutputError for another size or colour.
+    pixels; colour, camera: as for `Simulator.picture`, on one scale for all pictures. Raises OutputError for another size or
+    colour.
     """
 
     word = "pictures"
 
-    def __init__(self, size: tuple[int, int] = SIZE, colour: str = "stress"):
-        self.size = checked_size(size)
+    def __init__(self, size: tuple[int, int] = SIZE, colour: str = "stress", camera: Camera | None = None):
+        self.size, self._camera = checked_size(size), camera
         super().__init__(colour, self.size[1] + 84)
         self.pngs: list[bytes] = []  #: the pictures
         self._drawing: Offscreen | None = None
@@ -126,19 +116,17 @@ class Film(FramesOnPage):
         if not paths:
             raise OutputError(f"{folder / FRAMES_NAME}: there are no pictures of a run")
         try:
-            if fps is None:
-                settings = json.loads((folder / "report.json").read_text(encoding="utf-8"))["settings"]
-                fps = settings["fps"] or 1.0 / settings["dt"]
             film.pngs = [path.read_bytes() for path in paths]
-        except (OSError, ValueError, KeyError, TypeError) as error:
+        except OSError as error:
             raise OutputError(f"{folder}: the run cannot be read: {error}") from None
+        fps = fps or frame_rate(folder)
         film.times, film.scales = [int(path.stem) / fps for path in paths], [""] * len(paths)
         return film
 
     def __call__(self, sim, _index: int = 0, _report=None) -> None:
         """Add a picture of sim's present state."""
         if self._scene is not sim.scene:
-            self._drawing, self._scene = Offscreen(sim.scene, self.size, colour=self.colour), sim.scene
+            self._drawing, self._scene = Offscreen(sim.scene, self.size, self._camera, self.colour), sim.scene
         self.pngs.append(png_bytes(self._drawing.image(sim), COMPRESSION))
         self.scales.append(self._drawing.colouring.scale_text)
         self.times.append(sim.time)

@@ -4,14 +4,14 @@ Surfaces, lines as bands, and shadows on half-spaces are drawn with four samples
 """
 
 import operator
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 
 from taisoft.backend.runtime import open_kind, open_runtime
 from taisoft.errors import OutputError, value_text
-from taisoft.output.viewpoint import MAX_WIDENING, Viewpoint, framed_points
+from taisoft.output.viewpoint import Viewpoint
+from taisoft.scene.look import Camera
 from taisoft.view.colouring import background
 from taisoft.view.raster import Raster
 from taisoft.view.scene_view import IN_PICTURES, SceneView
@@ -37,7 +37,7 @@ def checked_size(size) -> tuple[int, int]:
 class Offscreen(SceneView):
     """Draws a scene's bodies and obstacles as pictures.
 
-    scene, size, camera, colour, layers, values, marks: as for `SceneView`. The kernels run in the open runtime, or in one of
+    scene, size, camera, colour, layers: as for `SceneView`. The kernels run in the open runtime, or in one of
     arch cpu that is claimed only while a picture is drawn. Raises OutputError.
     """
 
@@ -45,18 +45,16 @@ class Offscreen(SceneView):
         self,
         scene,
         size: tuple[int, int] = SIZE,
-        camera: Viewpoint | None = None,
+        camera: Viewpoint | Camera | None = None,
         colour: str = "body",
         layers: tuple[str, ...] = IN_PICTURES,
-        values: Callable | None = None,
-        marks=None,
     ):
         self.size = checked_size(size)
-        super().__init__(scene, self.size, camera, colour, layers, values, marks)
+        super().__init__(scene, self.size, camera, colour, layers)
         self._samples = (self.size[0] * SAMPLES, self.size[1] * SAMPLES)
         self._background = background(self.size)
         self._raster = Raster(self._samples)
-        self._shadows = Shadows(scene, self.surfaces)
+        self._shadows = Shadows(self.scene, self.surfaces)
         self._drawn_at: float | None = None  # time of the latest picture [s]
         self._before: dict = {}  # what was kept before it
 
@@ -82,29 +80,25 @@ class Offscreen(SceneView):
         return {"camera": self.camera.distance, "scale": list(self.colouring.scale)} | peaks
 
     def image(self, sim) -> np.ndarray:
-        """Return a picture of sim's present state, uint8 (height, width, 3), first row on top.
+        """Return a picture of a `DrawnState`, or of a simulator's present state, uint8 (height, width, 3), first row on top.
 
-        Raises OutputError after `close`.
+        Raises OutputError after `close`, and if a path fails.
         """
         if self._raster is None:
             raise OutputError("a picture cannot be drawn: its renderer is closed")
-        if sim.time != self._drawn_at:
-            self._before, self._drawn_at = self._present(), sim.time
-        x, colours, lines = self._drawn(sim, self.size)
+        state = self.sampled(sim)
+        if state.time != self._drawn_at:
+            self._before, self._drawn_at = self._present(), state.time
+        x, colours, lines = self._drawn(state, self.size)
         picture = self._background.copy()
         runtime = open_runtime(*(open_kind() or ("cpu", "f32")), owner="a picture renderer")
         try:
-            maps, texels = self._shadows.draw(x, sim.time)
+            maps, texels = self._shadows.draw(x, state.poses)
             drawn = self._triangles(x, np.column_stack([colours, texels]), lines)
             self._raster.draw(*drawn, self.camera.clipping[0], maps, picture)
         finally:
             runtime.close()
         return picture
-
-    def look_from(self, scene, azimuth: float, elevation: float) -> None:
-        """Frame the scene's start from another direction [deg], as of `Viewpoint`; the camera moves back as before."""
-        self.camera = Viewpoint.framing(framed_points(scene), self.size, up=scene.up, azimuth=azimuth, elevation=elevation)
-        self._widest = MAX_WIDENING * self.camera.distance
 
     def _triangles(self, x: np.ndarray, attributes: np.ndarray, lines: tuple) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return projected points, triangles and attributes: clipped surfaces, then lines as bands."""

@@ -13,6 +13,7 @@ import numpy as np
 
 from taisoft.mesh.solids import ray_hits
 from taisoft.output.viewpoint import Viewpoint
+from taisoft.view.drawn import DrawnState
 
 PATCH = 0.1  # radius in units of the diagonal of the body's bounding box at rest
 MIN_NODES = 4  # with fewer nodes in the patch, only those that carry the point are dragged
@@ -41,15 +42,15 @@ def nearest_hit(origin: np.ndarray, direction: np.ndarray, x: np.ndarray, triang
     return None if np.isinf(along[t]) else (t, np.array([1 - u[t] - v[t], u[t], v[t]]))
 
 
-def pick(sim, camera: Viewpoint, cursor: tuple[float, float], size: tuple[int, int]) -> Hit | None:
+def pick(state: DrawnState, camera: Viewpoint, cursor: tuple[float, float], size: tuple[int, int]) -> Hit | None:
     """Return the point of a body under the cursor, or None.
 
     cursor: in [0, 1] from the window's lower left corner; size: (width, height) of the window.
     """
     direction, best, distance = camera.ray(cursor, size), None, np.inf
-    for k, body in enumerate(sim.scene.bodies):
-        skin, x = body.riding_skin, sim.positions(body.name)
-        shown, triangles = (x, body.nodes.surface) if skin is None else (skin.weights @ x, skin.surface.triangles)
+    for k, body in enumerate(state.scene.bodies):
+        skin, x = body.weights, state.positions(body.name)
+        shown, triangles = (x, body.surface) if skin is None else (skin @ x, body.triangles)
         found = nearest_hit(camera.position, direction, shown, np.asarray(triangles))
         if found is None:
             continue
@@ -62,10 +63,10 @@ def pick(sim, camera: Viewpoint, cursor: tuple[float, float], size: tuple[int, i
 
 
 def _carriers(skin, corners: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return nodes (k,) and weights (k,) of a point, given by those of a drawn triangle's corners; skin: None without one."""
+    """Return nodes (k,) and weights (k,) of a point, given by those of a drawn triangle's corners; skin: its weights, or None."""
     if skin is None:
         return corners, weights
-    of_nodes = weights @ skin.weights[corners].toarray()
+    of_nodes = weights @ skin[corners].toarray()
     nodes = np.flatnonzero(of_nodes)
     return nodes, of_nodes[nodes]
 
@@ -76,14 +77,14 @@ class MouseDrag:
     body: its name; nodes (k,) with weights (k,) of sum 1: what is dragged; target: where the cursor holds it (3,) [m].
     """
 
-    def __init__(self, sim, hit: Hit):
-        body = sim.scene.bodies[hit.body]
+    def __init__(self, state: DrawnState, hit: Hit):
+        body = state.scene.bodies[hit.body]
         self.body = body.name
         rest = np.asarray(body.rest_positions)
         diagonal = float(np.linalg.norm(rest.max(axis=0) - rest.min(axis=0)))
         self.nodes, self.weights = _patch(rest, hit, PATCH * diagonal)
         self._plane = hit.point
-        self._offset = self._point(sim) - hit.point
+        self._offset = self._point(state) - hit.point
         self.target = hit.point + self._offset
 
     def move(self, camera: Viewpoint, cursor: tuple[float, float], size: tuple[int, int]) -> bool:
@@ -93,12 +94,12 @@ class MouseDrag:
         self.target = on_plane + self._offset
         return not np.array_equal(before, self.target)
 
-    def line(self, sim) -> np.ndarray:
+    def line(self, state: DrawnState) -> np.ndarray:
         """Return the line from the dragged point to the cursor's, (2,3) [m]."""
-        return np.array([self._point(sim), self.target]) - self._offset
+        return np.array([self._point(state), self.target]) - self._offset
 
-    def _point(self, sim) -> np.ndarray:
-        return self.weights @ sim.positions(self.body)[self.nodes]
+    def _point(self, state: DrawnState) -> np.ndarray:
+        return self.weights @ state.positions(self.body)[self.nodes]
 
 
 def _patch(rest: np.ndarray, hit: Hit, radius: float) -> tuple[np.ndarray, np.ndarray]:

@@ -6,15 +6,14 @@ and on request when all pictures are written. When its caller ends without a req
 
 import os
 import sys
-from dataclasses import fields
 from pathlib import Path
 from types import SimpleNamespace
 
 from taisoft.compile_message import silenced
 from taisoft.errors import TaisoftError, no_memory, reason
 from taisoft.view.child_process import serve
+from taisoft.view.drawn import DrawnScene
 from taisoft.view.link import Link, LinkClosed
-from taisoft.view.mirror import MirrorSimulation
 from taisoft.view.pictures import FAILURE, PictureOptions, picture_writer
 from taisoft.view.plots import PlotChoice
 
@@ -24,11 +23,9 @@ class Drawing:
 
     def __init__(self, link: Link, description: dict):
         self._link, self._caller = link, description["caller"]
-        self._sim = MirrorSimulation(description, description["n_nodes"])
-        options = PictureOptions(**{one.name: description[one.name] for one in fields(PictureOptions)})
+        self._scene, options = DrawnScene.from_plain(description["scene"]), PictureOptions(**description["options"])
         self._plots = PlotChoice(None, description["enabled"], tuple(options.plots)) if options.plots else None
-        drawn = {"values": self._sim.values_of, "marks": self._sim}
-        self._writer = picture_writer(Path(description["folder"]), self._sim.scene, options, self._plots, **drawn)
+        self._writer = picture_writer(Path(description["folder"]), self._scene, options, self._plots)
 
     def run(self) -> None:
         """Draw until the caller asks for the end or ends. The error that ends it before is sent."""
@@ -54,13 +51,12 @@ class Drawing:
             self._writer.flush()
             self._link.send({"flushed": True})
             return
-        nodes, slot = self._link.nodes, message["slot"]
-        self._sim.take(message, nodes.x[slot], nodes.values[slot])
+        state = self._link.nodes.take(self._scene, message["state"], message["slot"])
         if self._plots is not None:
             self._plots.history, self._plots.enabled = SimpleNamespace(**message["history"]), message["enabled"]
-        self._writer.frame(self._sim, message["index"])
+        self._writer.frame(state, message["index"])
         drawing = self._writer.renderer
-        self._link.send({"drawn": self._sim.time, "kept": [drawing.kept(self._sim.time), drawing.kept()]})
+        self._link.send({"drawn": state.time, "kept": [drawing.kept(state.time), drawing.kept()]})
 
 
 if __name__ == "__main__":

@@ -15,13 +15,11 @@ from taisoft.output.files import make_folder
 from taisoft.output.frames import FRAMES_NAME, FrameWriter
 from taisoft.view.annotations import Annotations
 from taisoft.view.child_process import ChildProcess
-from taisoft.view.colouring import NodalValues
-from taisoft.view.connection_layer import ConnectionMarks
+from taisoft.view.drawn import DrawnScene, DrawnState
 from taisoft.view.link import LinkClosed
-from taisoft.view.mirror import describe_scene, describe_state
 from taisoft.view.offscreen import SIZE, Offscreen
 from taisoft.view.plots import PlotChoice, Plots, plain_history
-from taisoft.view.scene_view import IN_PICTURES, scene_size
+from taisoft.view.scene_view import IN_PICTURES
 
 SLOTS = 8  # states that wait to be drawn, besides the pictures that wait to be written
 MIN_PICTURES = 30  # fewer take less time than it takes to start a process
@@ -48,14 +46,11 @@ class PictureOptions:
     view: tuple[float, float] | None = None
 
 
-def picture_writer(folder: Path, scene, options: PictureOptions, plots: PlotChoice | None, **drawn) -> FrameWriter:
-    """Return a `FrameWriter` that draws in this process.
-
-    plots: history of options.plots; drawn: values and marks, as for `Offscreen`. Raises OutputError.
-    """
-    drawing = Offscreen(scene, options.size, colour=options.colour, layers=tuple(options.layers), **drawn)
+def picture_writer(folder: Path, scene: DrawnScene, options: PictureOptions, plots: PlotChoice | None = None) -> FrameWriter:
+    """Return a `FrameWriter` that draws in this process. plots: history of options.plots. Raises OutputError."""
+    drawing = Offscreen(scene, options.size, colour=options.colour, layers=tuple(options.layers))
     if options.view is not None:
-        drawing.look_from(scene, *options.view)
+        drawing.look_from(options.size, azimuth=options.view[0], elevation=options.view[1])
     drawing.resume(options.kept)
     annotate = None
     if options.plots or options.caption is not None or options.bar:
@@ -64,19 +59,19 @@ def picture_writer(folder: Path, scene, options: PictureOptions, plots: PlotChoi
 
 
 def open_pictures(
-    folder: Path, sim, options: PictureOptions, plots: Plots | None, n_pictures: int
+    folder: Path, scene: DrawnScene, options: PictureOptions, plots: Plots | None, n_pictures: int
 ) -> "FrameWriter | PictureProcess":
-    """Return an observer that writes about n_pictures of sim; with a single core, or few pictures, it draws in this process.
+    """Return what writes about n_pictures of states; with a single core, or few pictures, it draws in this process.
 
     Both have `frame`, `flush`, `close` and `kept`. Raises OutputError.
     """
     if n_pictures < MIN_PICTURES or len(usable_cores()) < 2:
-        return picture_writer(folder, sim.scene, options, plots)
-    return PictureProcess(folder, sim, options, plots)
+        return picture_writer(folder, scene, options, plots)
+    return PictureProcess(folder, scene, options, plots)
 
 
 class PictureProcess:
-    """Observer that writes folder/frames/<index>.png in another process.
+    """Writes folder/frames/<index>.png of states in another process.
 
     plots: history of options.plots; child: arguments of Python that start the process, if not CHILD. What fails in the other
     process, and its end, raises OutputError at the next `frame`, `flush` or `close`; later pictures are not written. Raises
@@ -84,27 +79,29 @@ class PictureProcess:
     """
 
     def __init__(
-        self, folder: str | Path, sim, options: PictureOptions, plots: Plots | None = None, child: tuple[str, ...] | None = None
+        self,
+        folder: str | Path,
+        scene: DrawnScene,
+        options: PictureOptions,
+        plots: Plots | None = None,
+        child: tuple[str, ...] | None = None,
     ):
-        self.folder, scene = make_folder(Path(folder) / FRAMES_NAME).absolute(), sim.scene
-        self._options, self._layers, self._values = options, set(options.layers), NodalValues(scene.bodies)
-        self._plots = plots if options.plots else None
-        self._marks = ConnectionMarks(scene, scene_size(scene))
+        self.folder = make_folder(Path(folder) / FRAMES_NAME).absolute()
+        self._options, self._plots = options, plots if options.plots else None
         self._sent = self._drawn = 0  # numbers of states
         self._flushed, self._error = True, None
         self._drawn_at, self._kept = None, [options.kept, options.kept]  # time of the last picture [s]; before it, and after it
-        description = describe_scene(scene, self._marks) | asdict(options) | {"folder": str(self.folder.parent)}
+        description = {"scene": scene.plain(), "options": asdict(options), "folder": str(self.folder.parent)}
         description |= {"caller": os.getpid(), "enabled": self._plots.enabled if self._plots else {}}
-        n_nodes = sum(body.n_nodes for body in scene.bodies)
-        self._child: ChildProcess | None = ChildProcess(child or CHILD, description, FAILURE, n_nodes, SLOTS)
+        self._child: ChildProcess | None = ChildProcess(child or CHILD, description, FAILURE, len(scene.start), SLOTS)
 
     @property
     def pid(self) -> int | None:
         """Number of the other process, None after `close`."""
         return self._child and self._child.pid
 
-    def frame(self, sim, index: int) -> None:
-        """Hand over sim's present state, to be drawn as picture number index. Raises OutputError, also if a path fails."""
+    def frame(self, state: DrawnState, index: int) -> None:
+        """Hand over a state, to be drawn as picture number index. Raises OutputError."""
         if self._child is None:
             raise OutputError(f"picture {index} cannot be written to {self.folder}: its writer is closed")
         self._raise()
@@ -113,15 +110,11 @@ class PictureProcess:
         while self._sent - self._drawn >= SLOTS:
             self._read(None)
         nodes, slot = self._child.link.nodes, self._sent % SLOTS
-        state = describe_state(sim, self._marks, self._layers)
-        nodes.x[slot] = sim.positions()
-        if self._options.colour != "body":
-            nodes.values[slot] = self._values(self._options.colour, sim)
-        state |= {"slot": slot, "index": index, "colour": self._options.colour}
+        message = {"state": nodes.put(state, self._options.colour, slot), "slot": slot, "index": index}
         if self._plots is not None:
-            state |= {"enabled": self._plots.enabled, "history": plain_history(self._plots.history)}
+            message |= {"enabled": self._plots.enabled, "history": plain_history(self._plots.history)}
         self._sent += 1
-        self._send(state)
+        self._send(message)
 
     def flush(self) -> None:
         """Wait until all pictures are written. Raises OutputError."""

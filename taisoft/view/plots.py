@@ -20,6 +20,7 @@ from taisoft.errors import SceneError
 from taisoft.records import ERROR_KINDS, ErrorEstimate, StepReport
 from taisoft.scene.checks import nearest
 from taisoft.view.colouring import round_up
+from taisoft.view.drawn import ENERGIES
 
 BLUE, ORANGE, GREEN, DARK = (0.16, 0.42, 0.74), (0.87, 0.42, 0.13), (0.20, 0.56, 0.28), (0.30, 0.30, 0.36)  # sRGB
 COLOURS = (BLUE, ORANGE, GREEN, DARK)  # of a plot with curves by pair or body, as many as it shows
@@ -28,7 +29,6 @@ MIN_SPAN = 1e-200  # values that span less count as constant
 MAX_DECADES = 12  # of a logarithmic axis; smaller values, and zero, lie on its lower end
 OF_PAIRS = {"forces": "contact_force", "torques": "contact_torque"}  # plot by pair -> query
 CAPACITY = 256  # bins, an even number
-ENERGIES = ("kinetic", "elastic", "gravity")  # [J]
 SOLVERS = ("newton_residual", "contact_residual", "newton_iterations", "linear_iterations", "contact_iterations", "n_contacts")
 ERRORS = tuple(f"{kind}_error" for kind in ERROR_KINDS)  # over the largest excursion, in percent
 QUANTITIES = (*ENERGIES, "total", *SOLVERS, "step_time", *ERRORS)  # energies as changes since the start, wall time in [ms]

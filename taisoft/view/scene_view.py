@@ -10,33 +10,32 @@ connections. They are moved along their rays towards the eye, so that they cover
 front of their own surface, all others so far that nothing hides them.
 """
 
-from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 
 from taisoft.errors import OutputError
 from taisoft.mesh.topology import linked_groups, triangle_edges
 from taisoft.output.appearance import ObstacleSurface, ShownBodies, body_colours, obstacle_colour, obstacle_surfaces, subdivide
-from taisoft.output.viewpoint import MAX_WIDENING, Viewpoint, framed_points, start_positions
-from taisoft.scene.loads import value_at
+from taisoft.output.viewpoint import MAX_WIDENING, Viewpoint, camera_viewpoint
+from taisoft.scene.look import Camera
 from taisoft.scene.obstacles import HalfSpace
 from taisoft.view.colouring import Colouring, lit_colours
-from taisoft.view.connection_layer import ConnectionLayer, ConnectionMarks, PressureLayer, arrows
+from taisoft.view.connection_layer import ConnectionLayer, PressureLayer, arrows
+from taisoft.view.drawn import DrawnBody, DrawnScene, DrawnState
 from taisoft.view.ground import Square, finite_points
+from taisoft.view.sampling import MAX_CONTACTS, Sampler
 
 CREASE = 35.0  # [deg] between the normals of neighbouring triangles at rest
 MARKER_COLOUR = np.array([0.20, 0.22, 0.26])  # sRGB
 MARKER_SIZE = 0.16  # radius in units of the mean edge length of the body's surface
-MAX_MARKERS = 500  # per body; of more fixed nodes, evenly selected ones are shown
 
 LAYERS = ("wires", "contacts", "tractions", "pressures", "connections", "fibres", "fixed_nodes")
 IN_PICTURES = ("pressures", "connections", "fibres", "fixed_nodes")  # shown by default
 IN_WINDOW = ("tractions", *IN_PICTURES)
-MAX_MARK_LINES = 4000  # largest number of lines of contacts and arrows, besides the wires
-MAX_CONTACTS = MAX_MARK_LINES // 4  # of which lines are drawn
+MAX_MARK_LINES = 4 * MAX_CONTACTS  # largest number of lines of contacts and arrows, besides the wires
 ON_SURFACE, IN_FRONT = 0.996, 0.1  # fractions of the distance from the eye
 NORMAL, IMPULSE, ARROW = 0.04, 0.15, 0.10  # lengths relative to the scene's size
-MAX_ARROWS = 60  # of one traction
 DECAY = 0.99  # factor on the running maximum of impulses per picture
 WIRE_COLOUR, NORMAL_COLOUR = np.array([0.12, 0.14, 0.18]), np.array([0.10, 0.55, 0.25])  # sRGB
 IMPULSE_COLOUR, TRACTION_COLOUR = np.array([0.85, 0.12, 0.12]), np.array([0.55, 0.15, 0.65])
@@ -46,48 +45,62 @@ FIBRE_COLOUR = np.array([0.38, 0.06, 0.10])
 class SceneView:
     """A scene as it is drawn: its surfaces, their colours, its layers, and a camera.
 
-    scene: read once; size: (width, height) in pixels; camera: fixed if given, else it frames all bodies at the start, and where
-    they fall on a ground, and moves back, never nearer, when a body would leave the picture; colour: of the bodies, one of UNITS;
-    layers: names of visible LAYERS; values: as for `Colouring`; marks: as for `Layers`. Raises OutputError for unknown names.
+    scene: a Scene, which is read once, or what is drawn of one; size: (width, height) in pixels; camera: fixed if given, else the
+    scene's own, else it frames all bodies at the start, and where they fall on a ground, and moves back, never nearer, when a
+    body would leave the picture; colour: of the bodies, one of UNITS; layers: names of visible LAYERS. Raises OutputError for
+    unknown names.
     """
 
-    def __init__(
-        self,
-        scene,
-        size: tuple[int, int],
-        camera: Viewpoint | None,
-        colour: str,
-        layers: tuple[str, ...],
-        values: Callable | None = None,
-        marks=None,
-    ):
-        self.camera = camera or Viewpoint.framing(framed_points(scene), size, up=scene.up)
-        self._widest = 0.0 if camera else MAX_WIDENING * self.camera.distance  # largest automatic distance [m]; 0: fixed camera
-        self.surfaces = Surfaces(scene)
-        self.layers = Layers(scene, layers, marks)
-        self.colouring = Colouring(scene, self.surfaces, colour, values)
+    def __init__(self, scene, size: tuple[int, int], camera: Viewpoint | None, colour: str, layers: tuple[str, ...]):
+        self._sampler = None if isinstance(scene, DrawnScene) else Sampler(scene)
+        self.scene = scene if self._sampler is None else self._sampler.drawn
+        if isinstance(camera, Camera):
+            self.scene, camera = replace(self.scene, camera=camera), None
+        self._has_own = camera is None and self.scene.camera is not None  # whether the scene's camera is used
+        self.camera = camera or camera_viewpoint(self.scene, 0.0, self.scene.start)
+        self._widest = 0.0  # largest automatic distance [m]; 0: the camera does not move back
+        if self.camera is None:
+            self.look_from(size)
+        self.surfaces = Surfaces(self.scene)
+        self.layers = Layers(self.scene, layers)
+        self.colouring = Colouring(self.surfaces, colour)
 
-    def _drawn(self, sim, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray, tuple[np.ndarray, np.ndarray]]:
-        """Move the camera back if needed; return vertices and lit colours (n,3), and the lines of the layers."""
+    def look_from(self, size: tuple[int, int], **angles: float) -> None:
+        """Frame what the scene shows from the start on, from angles [deg] as of `Viewpoint`; the camera moves back as before."""
+        self.camera, self._has_own = Viewpoint.framing(self.scene.framed, size, up=self.scene.up, **angles), False
+        self._widest = MAX_WIDENING * self.camera.distance
+
+    def sampled(self, sim) -> DrawnState:
+        """Return the present state of a simulation of the scene, with what is visible; a `DrawnState` as it is."""
+        if isinstance(sim, DrawnState):
+            return sim
+        visible = [name for name, shown in self.layers.shown.items() if shown]
+        return self._sampler.state(sim, visible, [self.colouring.kind])
+
+    def _drawn(self, state: DrawnState, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray, tuple[np.ndarray, np.ndarray]]:
+        """Move the camera if needed; return vertices and lit colours (n,3), and the lines of the layers."""
         self.surfaces.with_markers = self.layers.shown["fixed_nodes"]
-        bodies = self.surfaces.of_bodies(sim)
+        bodies = self.surfaces.of_bodies(state)
+        if self._has_own:
+            self.camera = camera_viewpoint(self.scene, state.time, state.x)
         self.camera = self.camera.widened(bodies[0], size, self._widest)
-        x, normals = self.surfaces.with_obstacles(bodies, sim.time, self.camera.position)
-        colours = lit_colours(x, normals, self.colouring.base(sim), self.camera)
-        return x, colours, self.layers.lines(sim, self.camera)
+        x, normals = self.surfaces.with_obstacles(bodies, state, self.camera.position)
+        colours = lit_colours(x, normals, self.colouring.base(state), self.camera)
+        return x, colours, self.layers.lines(state, self.camera)
 
 
 class Surfaces:
     """All drawn surfaces as one triangle mesh of fixed topology and colours.
 
-    scene: its bodies and obstacles are read once. triangles: int32 (t,3) of drawn vertices, and body_triangles those of bodies
-    without markers; colours: float (n,3), unshaded sRGB.
+    scene: a Scene, which is read once, or what is drawn of one. triangles: int32 (t,3) of drawn vertices, and body_triangles
+    those of bodies without markers; colours: float (n,3), unshaded sRGB.
     """
 
     def __init__(self, scene):
+        scene = DrawnScene.of(scene)
         self._shown = ShownBodies(scene)
         surfaces = zip(scene.bodies, self._shown.surfaces, body_colours(scene))
-        self._bodies = [_BodySurface(body, *surface, colour, scene.constraints(body)) for body, surface, colour in surfaces]
+        self._bodies = [_BodySurface(body, *surface, colour) for body, surface, colour in surfaces]
         fixed = [o.shape for o in scene.obstacles if isinstance(o.shape, HalfSpace) and o.path is None]
         self._obstacles = [_RigidSurface(surface, fixed) for surface in obstacle_surfaces(scene)]
         nodes = [body.nodes + start for body, start in zip(self._bodies, self._shown.starts)]
@@ -104,13 +117,13 @@ class Surfaces:
         ranges = [slice(*ends) for ends in zip(firsts[len(self._bodies) :], firsts[len(self._bodies) + 1 :])]
         self._half_spaces = [(at, part) for at, part in zip(ranges, self._obstacles) if part.is_half_space]
 
-    def half_spaces(self, x: np.ndarray, t: float) -> list[tuple[slice, np.ndarray]]:
+    def half_spaces(self, x: np.ndarray, poses: dict) -> list[tuple[slice, np.ndarray]]:
         """Return, for every half-space, its range of drawn vertices and the vertices (k,3) [m] of its square.
 
-        x: (n,3) [m], of which the first are the bodies' drawn vertices; t: time [s].
+        x: (n,3) [m], of which the first are the bodies' drawn vertices; poses: as of `DrawnState`.
         """
         bodies = finite_points(x[: self.n_of_bodies])
-        return [(at, part.at(t, bodies)) for at, part in self._half_spaces]
+        return [(at, part.at(poses, bodies)) for at, part in self._half_spaces]
 
     def coloured(self, colours: np.ndarray) -> np.ndarray:
         """Return colours (n,3) of all drawn vertices, given colours (n_nodes,3) of the bodies' nodes."""
@@ -119,21 +132,23 @@ class Surfaces:
         all_colours[self._markers] = self.colours[self._markers]
         return all_colours
 
-    def of_bodies(self, sim) -> tuple[np.ndarray, np.ndarray]:
-        """Return positions [m] and unit normals of the bodies' drawn vertices in sim's present state, each float64 (n,3)."""
-        x = self._shown.of(sim.positions())[self._nodes]
+    def of_bodies(self, state: DrawnState) -> tuple[np.ndarray, np.ndarray]:
+        """Return positions [m] and unit normals of the bodies' drawn vertices, each float64 (n,3)."""
+        x = self._shown.of(state.x)[self._nodes]
         normals = vertex_normals(x, self.body_triangles)
         x[self._markers] += self.with_markers * self._radii[:, None] * self._balls
         normals[self._markers] = self._balls
         return x, normals
 
-    def with_obstacles(self, bodies: tuple[np.ndarray, np.ndarray], t: float, eye: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def with_obstacles(
+        self, bodies: tuple[np.ndarray, np.ndarray], state: DrawnState, eye: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Return positions and normals of all drawn vertices: those from `of_bodies`, then the obstacles'.
 
-        t: time [s]; eye: position (3,) [m], for culling. Raises OutputError if the path of an obstacle fails.
+        eye: position (3,) [m], for culling.
         """
         finite = finite_points(bodies[0]) if self._obstacles else bodies[0]
-        parts = [bodies, *(obstacle.vertices(t, finite, eye) for obstacle in self._obstacles)]
+        parts = [bodies, *(obstacle.vertices(state.poses, finite, eye) for obstacle in self._obstacles)]
         return np.concatenate([x for x, _ in parts]), np.concatenate([n for _, n in parts])
 
 
@@ -141,42 +156,36 @@ class Layers:
     """Optional layers beside the surfaces.
 
     shown: name -> whether it is visible, initially those in `names`; n_segments: largest number of lines that `lines` returns;
-    peak: recent maximum of impulses [N s], which scales their lines; marks: `ConnectionMarks`, by default of the scene. Raises
-    OutputError for an unknown name.
+    peak: recent maximum of impulses [N s], which scales their lines. Raises OutputError for an unknown name.
     """
 
-    def __init__(self, scene, names: tuple[str, ...] = IN_WINDOW, marks=None):
+    def __init__(self, scene, names: tuple[str, ...] = IN_WINDOW):
         for name in names:
             if name not in LAYERS:
                 raise OutputError(f"layer '{name}' is unknown: it must be one of {', '.join(LAYERS)}")
         self.shown = {name: name in names for name in LAYERS}
-        starts = np.cumsum([0] + [body.n_nodes for body in scene.bodies])
+        scene = DrawnScene.of(scene)
         self._shown = ShownBodies(scene)
         surfaces = zip(self._shown.surfaces, self._shown.starts)
         self._edges = np.concatenate([triangle_edges(triangles)[0] + n for (_, triangles), n in surfaces])
-        self._size, self.peak = scene_size(scene), 0.0
-        marks = marks or ConnectionMarks(scene, self._size)
-        self._strokes = marks.strokes
+        self._size, self.peak = scene.size, 0.0
+        firsts = {body.name: scene.rows[body.name].start for body in scene.bodies}
+        self._strokes = [(firsts[b.name] + b.strokes[0], b.strokes[1]) for b in scene.bodies if b.strokes is not None]
+        self._loaded = [firsts[body.name] + corners for body in scene.bodies for corners in body.loaded]
         self.n_segments = len(self._edges) + MAX_MARK_LINES + sum(len(nodes) for nodes, _ in self._strokes)
-        self.connections, self.pressures = ConnectionLayer(marks, self._size), PressureLayer(marks)
-        self._loaded = [  # per traction, nodes (k,3) of the triangles that get an arrow
-            body.mesh.surface[t.triangles[:: -(-len(t.triangles) // MAX_ARROWS)]] + n
-            for body, n in zip(scene.bodies, starts)
-            for t in body.tractions
-        ]
+        self.connections, self.pressures = ConnectionLayer(), PressureLayer()
 
-    def lines(self, sim, camera: Viewpoint) -> tuple[np.ndarray, np.ndarray]:
+    def lines(self, state: DrawnState, camera: Viewpoint) -> tuple[np.ndarray, np.ndarray]:
         """Return the ends (2k,3) [m] of the lines, as drawn for this camera, and their colours (2k,3)."""
-        x = sim.positions()
-        marks = self._contact_lines(sim) if self.shown["contacts"] else []
+        x = state.x
+        marks = self._contact_lines(**state.contacts) if self.shown["contacts"] and state.contacts else []
         if self.shown["tractions"]:
-            tractions = [value_at(t, sim.time, body.name) for body in sim.scene.bodies for t in body.tractions]
-            longest = max((float(np.linalg.norm(t)) for t in tractions), default=0.0) or 1.0
-            for corners, traction in zip(self._loaded, tractions):
+            longest = max((float(np.linalg.norm(t)) for t in state.tractions), default=0.0) or 1.0
+            for corners, traction in zip(self._loaded, state.tractions):
                 arrow = ARROW * self._size / longest * traction
                 marks.append((arrows(x[corners].mean(axis=1), arrow, camera), TRACTION_COLOUR))
         for name, layer in (("pressures", self.pressures), ("connections", self.connections)):
-            marks += layer.lines(sim, x, camera) if self.shown[name] else []
+            marks += layer.lines(state, camera) if self.shown[name] else []
         marks = [(camera.nearer(ends, IN_FRONT), colour) for ends, colour in marks]
         for nodes, weights in self._strokes if self.shown["fibres"] else ():
             ends = weights @ x[nodes]
@@ -187,22 +196,14 @@ class Layers:
         colours = [np.empty((0, 3)), *(np.broadcast_to(colour, part.shape) for part, colour in marks)]
         return np.concatenate(ends), np.concatenate(colours)
 
-    def _contact_lines(self, sim) -> list[tuple[np.ndarray, np.ndarray]]:
+    def _contact_lines(self, point: np.ndarray, normal: np.ndarray, impulse: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
         """Return lines of normals with a fixed length, and of impulses relative to the recent maximum."""
-        found = sim.contacts()
-        k = slice(0, MAX_CONTACTS)
-        point, normal, impulse = found.point[k], found.normal[k], found.impulse[k]
         self.peak = max(DECAY * self.peak, float(np.linalg.norm(impulse, axis=1).max(initial=0.0)))
         relative = impulse / self.peak if self.peak > 0.0 else 0.0 * impulse
         return [
             (_segments(point, point + NORMAL * self._size * normal), NORMAL_COLOUR),
             (_segments(point, point + IMPULSE * self._size * relative), IMPULSE_COLOUR),
         ]
-
-
-def scene_size(scene) -> float:
-    """Return the diagonal of the bodies' bounding box at the start [m]."""
-    return float(np.linalg.norm(np.ptp(start_positions(scene), axis=0)))
 
 
 class _BodySurface:
@@ -212,10 +213,10 @@ class _BodySurface:
     is_marker; balls (m,3), radii (m,): offsets of the markers' vertices, as unit vectors, and their lengths [m]; colours.
     """
 
-    def __init__(self, body, rest: np.ndarray, surface: np.ndarray, colour: np.ndarray, constraints: list):
+    def __init__(self, body: DrawnBody, rest: np.ndarray, surface: np.ndarray, colour: np.ndarray):
         nodes, corners = smoothing_groups(rest, surface)
         edges = rest[surface] - rest[np.roll(surface, 1, axis=1)]
-        marked = _fixed_surface_nodes(constraints, surface) if body.riding_skin is None else np.empty(0, dtype=np.int64)
+        marked = body.fixed
         ball, ball_triangles = _coarse_ball()
         counts = len(nodes), len(ball) * len(marked)
         starts = len(nodes) + len(ball) * np.arange(len(marked))
@@ -241,13 +242,15 @@ class _RigidSurface:
         self.triangles = np.arange(self._corners.size).reshape(-1, 3)
         self.colours = np.tile(obstacle_colour(surface.obstacle), (self._corners.size, 1))
 
-    def at(self, t: float, bodies: np.ndarray) -> np.ndarray:
-        """Return the vertices (n,3) [m] at time t [s], with bodies at (m,3) [m], all finite."""
-        moves = self._square is None or self._surface.obstacle.path is not None
-        return self._surface.at(t) if moves else self._square.below(bodies)
+    def at(self, poses: dict, bodies: np.ndarray) -> np.ndarray:
+        """Return the vertices (n,3) [m], with obstacles at poses, as of `DrawnState`, and bodies at (m,3) [m], all finite."""
+        pose = poses.get(self._surface.obstacle.name)
+        if pose is not None:
+            return self._surface.placed(*pose)
+        return self._surface.vertices if self._square is None else self._square.below(bodies)
 
-    def vertices(self, t: float, bodies: np.ndarray, eye: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        x = self.at(t, bodies)
+    def vertices(self, poses: dict, bodies: np.ndarray, eye: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        x = self.at(poses, bodies)
         if self._drawn is None or not (np.array_equal(x, self._drawn[0]) and np.array_equal(eye, self._drawn[1])):
             self._drawn = x, eye, self._culled(x[self._nodes], eye)
         return self._drawn[2]
@@ -304,14 +307,6 @@ def vertex_normals(x: np.ndarray, triangles: np.ndarray) -> np.ndarray:
 def _unit(vectors: np.ndarray) -> np.ndarray:
     length = np.linalg.norm(vectors, axis=1, keepdims=True)
     return vectors / np.where(length > 0, length, 1.0)
-
-
-def _fixed_surface_nodes(constraints: list, surface: np.ndarray) -> np.ndarray:
-    fixed = [constraint.nodes for constraint in constraints if constraint.path is None]
-    if not fixed:
-        return np.empty(0, dtype=np.int64)
-    nodes = np.intersect1d(np.concatenate(fixed), surface)
-    return nodes[:: -(-len(nodes) // MAX_MARKERS)] if len(nodes) else nodes
 
 
 def _coarse_ball() -> tuple[np.ndarray, np.ndarray]:

@@ -13,12 +13,11 @@ from taisoft.output.files import make_folder
 from taisoft.output.frames import png_bytes
 from taisoft.output.viewpoint import MAX_WIDENING, Viewpoint
 from taisoft.view.colouring import BACKGROUND_TOP
+from taisoft.view.drawn import DrawnScene, DrawnState
 from taisoft.view.ggui import Canvas
 from taisoft.view.keys import ACTIONS
-from taisoft.view.mirror import MirrorSimulation
 from taisoft.view.panel import Panel, Requests, wrapped
 from taisoft.view.picking import MouseDrag, pick
-from taisoft.view.plots import ENERGIES
 from taisoft.view.scene_view import IN_FRONT, SceneView
 from taisoft.view.timing import Note, Timing
 from taisoft.view.window_shadow import ShadowMesh
@@ -38,19 +37,19 @@ FOR_SIMULATION = {"pause", "step", "reset", "faster", "slower", "unbound"}  # ac
 class Screen(SceneView):
     """The window. The user may change colours and layers and move the camera, which then follows the bodies no more.
 
-    sim: the latest state; description: what `WindowProcess` sends. requests: gets commands, if the window has controls; timing:
+    description: what `WindowProcess` sends. requests: gets commands, if the window has controls; timing:
     of pictures and drags. Raises OutputError, before anything is opened, if a display or a Vulkan driver is missing or a name is
     unknown.
     """
 
-    def __init__(self, sim: MirrorSimulation, description: dict, requests: Requests):
-        super().__init__(sim.scene, SIZE, None, description["colour"], tuple(description["layers"]), sim.values_of, sim)
+    def __init__(self, scene: DrawnScene, description: dict, requests: Requests):
+        super().__init__(scene, SIZE, None, description["colour"], tuple(description["layers"]))
         self.timing = Timing()
         self.layers.shown["shadows"] = True
         self._requests = requests
         self._panel: Panel | None = None
         if description["controls"]:
-            names = [body.name for body in sim.scene.bodies]
+            names = [body.name for body in scene.bodies]
             self._panel = Panel(names, description["pairs"], self.colouring, self.layers, requests)
         self._panel_rectangle = PANEL if self._panel is not None else SHORT_PANEL
         self._cursor: tuple[float, float] | None = None  # at the last picture
@@ -62,7 +61,7 @@ class Screen(SceneView):
         self._screenshot = False  # requested
         self._note = Note()  # about pictures and camera
         self._messages: list[str] = []  # those shown
-        self._shadow_mesh = ShadowMesh(sim.scene, self.surfaces)
+        self._shadow_mesh = ShadowMesh(scene, self.surfaces)
         n_segments, n_decals = self.layers.n_segments + 1, self._shadow_mesh.size
         self._canvas = Canvas(self.surfaces, SIZE, visible=True, n_segments=n_segments, n_decals=n_decals)
 
@@ -80,30 +79,30 @@ class Screen(SceneView):
         """Destroy the window; a second call does nothing."""
         self._canvas.close()
 
-    def draw(self, sim: MirrorSimulation, state: dict, age: float) -> None:
+    def draw(self, drawn: DrawnState, state: dict, age: float) -> None:
         """Draw a state, show it, and process keys and mouse. age: wall time since it came [s]."""
         window = self._canvas.window
         size = window.get_window_shape()
-        self._follow(sim)
-        x, colours, (ends, line_colours) = self._drawn(sim, size)
+        self._follow(drawn)
+        x, colours, (ends, line_colours) = self._drawn(drawn, size)
         if self._drag is not None:
-            dragged = self.camera.nearer(self._drag.line(sim), IN_FRONT)
+            dragged = self.camera.nearer(self._drag.line(drawn), IN_FRONT)
             ends = np.concatenate([dragged, ends])
             line_colours = np.concatenate([np.tile(DRAG_COLOUR, (2, 1)), line_colours])
-        shadows = self._shadow_mesh.draw(x, sim.time, self.camera) if self.layers.shown["shadows"] else None
+        shadows = self._shadow_mesh.draw(x, drawn.poses, self.camera) if self.layers.shown["shadows"] else None
         self._canvas.draw(x, colours, self.camera, tuple(BACKGROUND_TOP), (ends, line_colours), shadows)
         self._take_picture(size)
         # lines above the sliders must be constant in number: a transient line would move the sliders under the cursor
         with window.get_gui().sub_window("taisoft", *self._panel_rectangle) as gui:
-            for line in [state["status"], *state_lines(sim), *self.timing.lines(state)]:
+            for line in [state["status"], *state_lines(drawn), *self.timing.lines(state)]:
                 gui.text(line)
             if self._panel is not None:
                 self._panel.draw(gui, state)
         self._show_messages(window.get_gui(), state, age)
         window.show()
         self.timing.shown(state)
-        self._read_keys(sim, size)
-        self._read_mouse(sim, size)
+        self._read_keys(drawn, size)
+        self._read_mouse(drawn, size)
         self.timing.polled()
 
     def _show_messages(self, gui, state: dict, age: float) -> None:
@@ -118,9 +117,9 @@ class Screen(SceneView):
 
     # --- camera -------------------------------------------------------------------------------------------------------
 
-    def _follow(self, sim: MirrorSimulation) -> None:
+    def _follow(self, drawn: DrawnState) -> None:
         """Move the camera's target with the mean position of the nodes, but not while a body is dragged."""
-        x = sim.positions()
+        x = drawn.x
         x = x[np.isfinite(x).all(axis=1)]
         if not self._follows or self._drag is not None or len(x) == 0:
             self._centre = None
@@ -130,19 +129,19 @@ class Screen(SceneView):
             self.camera = replace(self.camera, target=self.camera.target + centre - self._centre)
         self._centre = centre
 
-    def _frame(self, sim: MirrorSimulation, size: tuple[int, int]) -> None:
+    def _frame(self, drawn: DrawnState, size: tuple[int, int]) -> None:
         """Frame the bodies from the present direction; from then on the camera moves back again if they would leave."""
-        x = sim.positions()
+        x = drawn.x
         x = x[np.isfinite(x).all(axis=1)]
         if len(x):
             kept = {name: getattr(self.camera, name) for name in ("up", "azimuth", "elevation")}
-            self.camera = Viewpoint.framing(x, size, **kept)
+            self.camera, self._has_own = Viewpoint.framing(x, size, **kept), False
             self._widest = MAX_WIDENING * self.camera.distance
 
     def _move_camera(self, right: float, up: float, size) -> None:
         """Move the camera by a displacement of the cursor."""
         if self._mode in ("turn", "zoom", "shift"):
-            self._widest = 0.0
+            self._widest, self._has_own = 0.0, False
         if self._mode == "turn":
             self.camera = self.camera.orbit(-ORBIT * right, -ORBIT * up)
         elif self._mode == "zoom":
@@ -152,7 +151,7 @@ class Screen(SceneView):
 
     # --- keys and mouse -----------------------------------------------------------------------------------------------
 
-    def _read_keys(self, sim: MirrorSimulation, size) -> None:
+    def _read_keys(self, drawn: DrawnState, size) -> None:
         events = self._canvas.window.get_events(ti.ui.PRESS)
         pressed = {ACTIONS[event.key] for event in events if event.key in ACTIONS}
         self._close_requested |= "close" in pressed
@@ -165,13 +164,13 @@ class Screen(SceneView):
         if "colour" in pressed:
             self.colouring.choose_next()
         if "frame" in pressed:
-            self._frame(sim, size)
+            self._frame(drawn, size)
         if "follow" in pressed:
             self._follows, self._centre, self._widest = not self._follows, None, 0.0
             self._note.set("the camera follows the bodies" if self._follows else "the camera stays")
         self._screenshot |= "screenshot" in pressed
 
-    def _read_mouse(self, sim: MirrorSimulation, size) -> None:
+    def _read_mouse(self, drawn: DrawnState, size) -> None:
         window = self._canvas.window
         button = next((b for b in (ti.ui.LMB, ti.ui.RMB, ti.ui.MMB) if window.is_pressed(b)), None)
         cursor = window.get_cursor_pos()  # from the lower left corner, in [0, 1]
@@ -181,7 +180,7 @@ class Screen(SceneView):
                 self._requests.add("release")
             self._mode = ""
         elif not self._mode:
-            self._mode = self._begin_drag(sim, button, cursor, size)
+            self._mode = self._begin_drag(drawn, button, cursor, size)
         else:
             self._move_camera(cursor[0] - self._cursor[0], cursor[1] - self._cursor[1], size)
         if self._drag is not None and self._drag.move(self.camera, cursor, size):
@@ -189,7 +188,7 @@ class Screen(SceneView):
             self.timing.dragged(self._requests.next_number)
         self._cursor = cursor
 
-    def _begin_drag(self, sim: MirrorSimulation, button, cursor, size) -> str:
+    def _begin_drag(self, drawn: DrawnState, button, cursor, size) -> str:
         """Start a mouse drag at the cursor and return its mode."""
         x, y = cursor[0] * size[0], (1.0 - cursor[1]) * size[1]
         rectangles = [self._panel_rectangle, *([MESSAGES] if self._messages else [])]
@@ -199,10 +198,10 @@ class Screen(SceneView):
             return "zoom" if button == ti.ui.RMB else "shift"
         can_drag = self._panel is not None and self._panel.strength > 0.0
         if can_drag and not self._canvas.window.is_pressed(ti.ui.CTRL):
-            hit = pick(sim, self.camera, cursor, size)
+            hit = pick(drawn, self.camera, cursor, size)
             if hit is not None:
                 self._widest = 0.0  # a camera that moves back would move the drag's target
-                drag = self._drag = MouseDrag(sim, hit)
+                drag = self._drag = MouseDrag(drawn, hit)
                 self._panel.chosen = drag.body
                 self._requests.add("begin_drag", drag.body, drag.nodes, drag.weights, key="begin_drag")
                 self._requests.add("drag", drag.target.tolist(), self._panel.strength, key="drag")
@@ -239,7 +238,6 @@ def _contains(rectangle: tuple[float, float, float, float], x: float, y: float) 
     return left <= x <= left + width and top <= y <= top + height
 
 
-def state_lines(sim) -> list[str]:
-    """Return time and energies of sim as lines of text."""
-    energies = sim.energies()
-    return [f"time     {sim.time:10.4f} s", *(f"{name:8} {getattr(energies, name):10.4g} J" for name in ENERGIES)]
+def state_lines(drawn: DrawnState) -> list[str]:
+    """Return time and energies of a state as lines of text."""
+    return [f"time     {drawn.time:10.4f} s", *(f"{name:8} {energy:10.4g} J" for name, energy in drawn.energies.items())]

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from taisoft.mesh.placing import UP
-from taisoft.output.viewpoint import start_positions
 from taisoft.view.raster import Raster
 
 TEXELS = 128  # per side of a map
@@ -39,30 +38,30 @@ class ShadowMap:
 
 
 class Shadows:
-    """Shadow maps of the half-spaces of `Surfaces`. scene: read once."""
+    """Shadow maps of the half-spaces of `Surfaces`. scene: a `DrawnScene`."""
 
     def __init__(self, scene, surfaces):
         self._surfaces, self._up = surfaces, UP[scene.up]
-        self._size = float(np.linalg.norm(np.ptp(start_positions(scene), axis=0)))
+        self._size = scene.size
         self._raster: Raster | None = None  # made for the first half-space
 
-    def draw(self, x: np.ndarray, t: float) -> tuple[np.ndarray, np.ndarray]:
-        """Draw the maps for drawn vertices x (n,3) [m] at time t [s].
+    def draw(self, x: np.ndarray, poses: dict) -> tuple[np.ndarray, np.ndarray]:
+        """Draw the maps for drawn vertices x (n,3) [m] and obstacles at poses, as of `DrawnState`.
 
         Returns the maps (maps, v, u) and, for every vertex, u and v in texels and the number of its map, -1 if none: (n,3).
         """
         at = np.zeros((len(x), 3))
         at[:, 2] = -1.0
-        maps = self.maps(x, t)
+        maps = self.maps(x, poses)
         for k, one in enumerate(maps):
             at[one.vertices, :2] = ((x[one.vertices] - one.origin) @ one.axes[:2].T - one.low) / one.texel
             at[one.vertices, 2] = k
         return np.array([one.darkness for one in maps]) if maps else np.zeros((1, 2, 2)), at
 
-    def maps(self, x: np.ndarray, t: float) -> list["ShadowMap"]:
+    def maps(self, x: np.ndarray, poses: dict) -> list["ShadowMap"]:
         """Return the maps of all half-spaces with shadows, as for `draw`."""
         found = []
-        for vertices, boundary in self._surfaces.half_spaces(x, t):
+        for vertices, boundary in self._surfaces.half_spaces(x, poses):
             axes = _frame(boundary)
             if axes is None or axes[2] @ self._up < MIN_SLOPE:
                 continue

@@ -14,14 +14,12 @@ from taisoft.errors import OutputError
 from taisoft.frames import dt_sentence, fit_dt
 from taisoft.records import RunReport, StepReport
 from taisoft.view.child_process import ChildProcess
-from taisoft.view.colouring import NodalValues
-from taisoft.view.connection_layer import ConnectionMarks
 from taisoft.view.controls import touching_pairs
 from taisoft.view.ggui import display_missing, vulkan_missing
 from taisoft.view.link import LinkClosed
 from taisoft.view.live import LiveRun
-from taisoft.view.mirror import describe_scene, describe_state
-from taisoft.view.scene_view import IN_WINDOW, scene_size
+from taisoft.view.sampling import Sampler
+from taisoft.view.scene_view import IN_WINDOW
 
 FAILURE = "cannot open a window"
 START_SECONDS = 60.0  # in which the window must open
@@ -49,16 +47,14 @@ class WindowProcess:
         missing = display_missing() or vulkan_missing()
         if missing:
             raise OutputError(f"{FAILURE}: {missing}")
-        scene = sim.scene
-        n_nodes = sum(body.n_nodes for body in scene.bodies)
-        self._values, self._colour, self._layers = NodalValues(scene.bodies), colour, set(layers)
+        self._sampler, self._colour, self._layers = Sampler(sim.scene), colour, set(layers)
         self._sent = self._confirmed = self._answered = 0  # numbers of states, and of the last request
         self._requests: list[tuple[int, list]] = []  # not yet returned
         self.closed, self.timing = False, {}
-        self._marks = ConnectionMarks(scene, scene_size(scene))
-        description = describe_scene(scene, self._marks) | {"fps": FPS, "colour": colour, "layers": list(layers)}
+        drawn = self._sampler.drawn
+        description = {"scene": drawn.plain(), "fps": FPS, "colour": colour, "layers": list(layers)}
         description |= {"controls": controls, "pairs": touching_pairs(sim) if controls else []}
-        self._child = ChildProcess(child or CHILD, description, FAILURE, n_nodes)
+        self._child = ChildProcess(child or CHILD, description, FAILURE, len(drawn.start))
         self._link = self._child.link
         try:
             self._wait_until_open()
@@ -124,14 +120,10 @@ class WindowProcess:
             self._read(left)
         if not self.ready or self.closed:
             return
-        state = describe_state(sim, self._marks, self._layers)
-        self._link.nodes.x[0] = sim.positions()
-        if self._colour != "body":
-            self._link.nodes.values[0] = self._values(self._colour, sim)
+        state = self._link.nodes.put(self._sampler.state(sim, self._layers, [self._colour]), self._colour)
         self._sent += 1
-        state |= {"number": self._sent, "answered": self._answered, "colour": self._colour} | shown
         try:
-            self._link.send(state)
+            self._link.send({"state": state, "number": self._sent, "answered": self._answered} | shown)
         except LinkClosed:
             while self._read(0.0):  # it may have been closed by its user
                 pass

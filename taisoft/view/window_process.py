@@ -8,8 +8,8 @@ import sys
 import time
 
 from taisoft.view.child_process import serve
+from taisoft.view.drawn import DrawnScene, DrawnState
 from taisoft.view.link import Link
-from taisoft.view.mirror import MirrorSimulation
 from taisoft.view.panel import Requests
 from taisoft.view.screen import Screen
 
@@ -23,9 +23,9 @@ class View:
     """The window with the state that it shows. link: to the simulation, with the description that came over it."""
 
     def __init__(self, link: Link, description: dict):
-        self._link, self._sim = link, MirrorSimulation(description, description["n_nodes"])
-        self._requests = Requests()
-        self._screen = Screen(self._sim, description, self._requests)
+        self._link, self._scene, self._requests = link, DrawnScene.from_plain(description["scene"]), Requests()
+        self._drawn = DrawnState.at_start(self._scene)
+        self._screen = Screen(self._scene, description, self._requests)
         self._interval = 1.0 / description["fps"]
         self._state: dict = {}
         self._came = 0.0  # when the state came
@@ -43,7 +43,7 @@ class View:
         self._receive(None)
         while not self._ended and not self._screen.closed:
             begin = time.perf_counter()
-            self._screen.draw(self._sim, self._state, begin - self._came)
+            self._screen.draw(self._drawn, self._state, begin - self._came)
             self._send()
             self._wait(begin, time.perf_counter())
         if not self._ended:
@@ -70,7 +70,7 @@ class View:
                 self._ended = True
                 return
             self._state, self._came = message, time.perf_counter()
-            self._sim.take(message, self._link.nodes.x[0], self._link.nodes.values[0])
+            self._drawn = self._link.nodes.take(self._scene, message["state"])
             self._screen.timing.came(message)
             self._send()  # at once, so that the simulation may send the next one
 

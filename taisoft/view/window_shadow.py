@@ -33,13 +33,13 @@ class ShadowMesh:
         self._triangles = np.concatenate([corner + [0, 1, side], corner + [1, side + 1, side]])
         self.size = (n_maps * side * side, n_maps * len(self._triangles))
 
-    def draw(self, x: np.ndarray, t: float, camera: Viewpoint) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+    def draw(self, x: np.ndarray, poses: dict, camera: Viewpoint) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
         """Return positions [m] and lit colours (n,3) of the meshes and their triangles (t,3), or None without a shadow.
 
-        x: (n,3) drawn vertices of `Surfaces`; t: time [s].
+        x: (n,3) drawn vertices of `Surfaces`; poses: of obstacles, as of `DrawnState`.
         """
         points, colours, triangles = [], [], []
-        for one in self._shadows.maps(x, t):
+        for one in self._shadows.maps(x, poses):
             if (camera.position - one.origin) @ one.axes[2] <= 0.0:
                 continue
             own = one.origin + _inside(one.square, self._texels * one.texel + one.low) @ one.axes[:2]

@@ -200,7 +200,7 @@ def paths_check(n):
 
 def pictures_small(patch, folder):
     replace(patch, pictures, DEMOS={"hanging_beam": 0.5}, PICTURES=2, QUICK_ROUNDS=1)
-    replace(patch, pictures, PictureProcess=lambda path, sim, options: picture_writer(path, sim.scene, options, None))
+    replace(patch, pictures, PictureProcess=picture_writer)
 
 
 def pictures_check(n):

@@ -1,6 +1,7 @@
 """Connections, pressures and poses in what a run writes: polylines, pictures, curves of USD, and `frames.csv`."""
 
 import csv
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -13,7 +14,8 @@ from taisoft.output.frame_table import FrameTable
 from taisoft.output.usd import UsdWriter
 from taisoft.output.viewpoint import Viewpoint
 from taisoft.view.colouring import COLOURS
-from taisoft.view.connection_layer import ATTACHED_COLOUR, PRESSURE_COLOUR, ConnectionMarks, PressureLayer
+from taisoft.view.connection_layer import ATTACHED_COLOUR, PRESSURE_COLOUR, PressureLayer
+from taisoft.view.drawn import DrawnScene, DrawnState
 from taisoft.view.offscreen import Offscreen
 from tests.collision.rotations import rotation
 from tests.dynamics.scenes import cube, rubber
@@ -106,8 +108,10 @@ def hollow_scene() -> ts.Scene:
 def test_arrows_point_along_the_force(pressure):
     """A push ends at the surface, a pull begins there; the longest belongs to the highest pressure."""
     scene, camera = hollow_scene(), Viewpoint(np.zeros(3), 10.0)
-    sim = SimpleNamespace(scene=scene, time=0.0, cavity_pressure={"water": pressure}.get)
-    found = PressureLayer(ConnectionMarks(scene, 3.0)).lines(sim, scene.bodies[0].rest_positions, camera)
+    drawn = DrawnScene.of(scene)
+    drawn.pressed = [(corners, 3.0 / drawn.size * longest) for corners, longest in drawn.pressed]  # as for a scene of 3 m
+    state = replace(DrawnState.at_start(drawn), pressures=[1.0, pressure])
+    found = PressureLayer().lines(state, camera)
     shafts = [ends[: len(ends) // 3].reshape(-1, 2, 3) for ends, _ in found]  # of the side, then of the cavity
     assert shafts[0][:, 1, 0] == pytest.approx(1.5) and np.allclose(shafts[0][:, 0] - shafts[0][:, 1], (0.105, 0, 0))
     start, tip = np.abs(shafts[1]).max(axis=2).T  # in the norm whose unit ball is a cube

@@ -11,6 +11,7 @@ from taisoft.output.usd import UsdWriter
 from taisoft.view.scene_view import Surfaces
 from tests.collision.rotations import rotation
 from tests.output.usd_stage import faults
+from tests.view.drawing import sampled
 from tests.view.fake_simulator import RUBBER, FakeSimulator
 
 BALL = ts.ball_mesh(0.5, 4)
@@ -89,9 +90,11 @@ def test_surfaces_follow_paths():
 def test_triangles_that_face_the_eye_are_drawn():
     scene = make_scene(ground=(ts.HalfSpace((0, 0, 0), (0, 1, 0)), None), box=(SOLIDS["box"][0], rolling))
     surfaces, sim = Surfaces(scene), FakeSimulator(scene)
-    bodies, (translation, Q) = surfaces.of_bodies(sim), rolling(0.5)
+    sim.time, (translation, Q) = 0.5, rolling(0.5)
+    state = sampled(sim)
+    bodies = surfaces.of_bodies(state)
     for eye, above in (((3.0, 9.0, 9.0), True), ((3.0, -9.0, 9.0), False)):
-        x, normals = surfaces.with_obstacles(bodies, 0.5, np.array(eye))
+        x, normals = surfaces.with_obstacles(bodies, state, np.array(eye))
         assert len(x) == len(normals) == len(surfaces.colours) and np.array_equal(x[: len(bodies[0])], bodies[0])
         area = np.linalg.norm(area_vectors(x, surfaces.triangles), axis=1)
         assert (area[len(bodies[0]) // 3 : -12].sum() > 10.0) == above

@@ -54,10 +54,10 @@ ORDER = (
     ("settings",),
     ("dynamics",),
     ("output.viewpoint", "output.nodal_fields"),
-    ("output.appearance", "view.shading"),
+    ("output.appearance", "view.shading", "view.drawn"),
     ("view.colouring", "view.raster"),
     ("output.connection_lines",),
-    ("view.connection_layer", "view.ground"),
+    ("view.connection_layer", "view.ground", "view.sampling"),
     ("view.scene_view", "view.shadow"),
     (
         *("simulator", "queries", "contact_queries", "changes", "commanding", "energy_check", "frames", "running", "static"),

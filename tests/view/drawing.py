@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 
 import taisoft as ts
-from taisoft.view.connection_layer import ConnectionMarks
+from taisoft.nested import from_json, to_json
+from taisoft.view.drawn import DrawnScene, DrawnState
 from taisoft.view.ggui import vulkan_missing
-from taisoft.view.scene_view import scene_size
+from taisoft.view.sampling import Sampler
 from tests.dynamics.scenes import rubber
 from tests.view.fake_simulator import beam_scene
 
@@ -25,8 +26,17 @@ def body_mask(image):
     return rgb.max(axis=2) - rgb.min(axis=2) > 20
 
 
-def marks_of(scene) -> ConnectionMarks:
-    return ConnectionMarks(scene, scene_size(scene))
+def sampled(sim, layers=(), *kinds):
+    """The state of a simulation, which travelled as plain data."""
+    sampler = Sampler(sim.scene)
+    state = sampler.state(sim, layers, kinds)
+    arrays = {"displacement": state.displacement, "values": state.values}
+    return DrawnState(travelled(sampler.drawn), **from_json(to_json(state.plain())), **arrays)
+
+
+def travelled(drawn: DrawnScene) -> DrawnScene:
+    """A scene from its plain data."""
+    return DrawnScene.from_plain(from_json(to_json(drawn.plain())))
 
 
 def moving_scene() -> ts.Scene:

@@ -17,7 +17,7 @@ from taisoft.view.offscreen import Offscreen, stroke
 from taisoft.view.raster import Raster
 from taisoft.view.scene_view import IMPULSE_COLOUR, MARKER_COLOUR, NORMAL_COLOUR, TRACTION_COLOUR, WIRE_COLOUR, Surfaces
 from taisoft.view.window import show
-from tests.view.drawing import SIZE, body_mask, needs_vulkan
+from tests.view.drawing import SIZE, body_mask, needs_vulkan, sampled
 from tests.view.fake_simulator import FakeSimulator, beam_scene
 
 LARGE = (640, 360)
@@ -57,7 +57,7 @@ def test_falling_body_stays_in_the_picture():
     assert 170 <= np.flatnonzero(mask.any(axis=1)).max() <= 175, "complete, with a border of 3 % below"
     image = Offscreen(scene, SIZE, Viewpoint(np.array([0.0, 100.0, 0.0]), 5.0)).image(FakeSimulator(scene))
     assert not body_mask(image).any() and image.std(axis=1).max() == 0, "the background alone"
-    drawing.look_from(scene, 90.0, 0.0)  # along the beam
+    drawing.look_from(SIZE, azimuth=90.0, elevation=0.0)  # along the beam
     assert np.allclose(drawing.camera.forward, (-1, 0, 0))
     assert np.ptp(drawing.camera.project(start_positions(scene), SIZE)[:, 0]) < 0.5 * SIZE[0]
 
@@ -105,7 +105,7 @@ def test_layers_are_drawn_where_they_are_seen():
     lines = np.abs(wired - plain).max(axis=2) > 20
     outline = inside & ~np.all([np.roll(inside, by, axis) for axis in (0, 1) for by in (-2, 2)], axis=0)
     assert (lines & ~inside & ~outline).sum() < 0.2 * lines.sum(), "wires are drawn on the bodies"
-    ends, _ = draw[1].layers.lines(sim, draw[1].camera)
+    ends, _ = draw[1].layers.lines(sampled(sim), draw[1].camera)
     length = np.linalg.norm(np.diff(draw[1].camera.project(ends, LARGE)[:, :2].reshape(-1, 2, 2), axis=1), axis=2).sum()
     assert lines.sum() < 0.85 * 1.25 * length, "some of them are hidden"
     dark = (fixed < 60).all(axis=2)
@@ -130,12 +130,13 @@ def test_a_band_has_its_width():
 @pytest.mark.parametrize("order", [1, 2])
 def test_a_stretched_bar_has_its_stretch_at_every_node(order):
     scene = beam_scene(order=order)
-    sim, colouring = FakeSimulator(scene), Colouring(scene, Surfaces(scene), "stretch")
+    sim, colouring = FakeSimulator(scene), Colouring(Surfaces(scene), "stretch")
     turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
     x = sim.positions()
     sim.positions = lambda name=None: x * (1.3, 0.9, 0.9) @ turn
-    assert np.allclose(colouring.values("stretch", sim), 1.3)
-    colouring.base(sim)
+    state = sampled(sim, (), "stretch")
+    assert np.allclose(state.values["stretch"], 1.3)
+    colouring.base(state)
     assert colouring.low == 1.0 and colouring.span == pytest.approx(0.5)
     assert colouring.legend()[0][0].strip() == "1.5" and np.array_equal(colouring.legend()[0][1], COLOURS[-1])
 
@@ -147,9 +148,11 @@ def with_speed(sim, speed):
 
 def test_the_scale_does_not_flicker():
     scene = beam_scene()
-    sim, colouring, spans = FakeSimulator(scene), Colouring(scene, Surfaces(scene), "speed"), []
+    sim, colouring, spans = FakeSimulator(scene), Colouring(Surfaces(scene), "speed"), []
+    state = sampled(sim)
     for value in [3.0, 2.1, 4.9, 5.1, 4.8, *[5.2, 4.9] * 50, *[0.3] * 2000]:
-        colouring.base(with_speed(sim, value))
+        state.values["speed"] = np.full(len(state.x), value)
+        colouring.base(state)
         spans.append(colouring.span)
     assert spans[:4] == [5.0, 5.0, 5.0, 10.0] and set(spans[3:105]) == {10.0}
     assert spans[-1] == 0.5 and (np.diff(spans[105:]) <= 0).all()
@@ -182,7 +185,7 @@ def test_bodies_alone_are_coloured_by_stress():
     scene.add_obstacle(ts.HalfSpace((0, -3, 0), (0, 1, 0)))
     surfaces, sim = Surfaces(scene), FakeSimulator(scene)
     sim.time = 1.0
-    base = Colouring(scene, surfaces, "stress").base(sim)
+    base = Colouring(surfaces, "stress").base(sampled(sim, (), "stress"))
     kept = (base == surfaces.colours).all(axis=1)
     grey = surfaces.colours.max(axis=1) - surfaces.colours.min(axis=1) < 0.1
     marked = (surfaces.colours == MARKER_COLOUR).all(axis=1)

@@ -11,12 +11,11 @@ import taichi as ti
 import taisoft as ts
 from taisoft.output.viewpoint import Viewpoint
 from taisoft.view.controls import Controls, touching_pairs
-from taisoft.view.mirror import MirrorSimulation, describe_scene, describe_state
 from taisoft.view.panel import Panel, Requests
 from taisoft.view.screen import SIZE, Screen
 from taisoft.view.timing import Timing
 from tests.output.png import decode
-from tests.view.drawing import connected_scene, cubes_scene, marks_of
+from tests.view.drawing import connected_scene, cubes_scene, sampled
 from tests.view.fake_simulator import FakeSimulator
 
 
@@ -194,18 +193,15 @@ class FakeCanvas(Gui):
 @pytest.fixture
 def screen(cubes, monkeypatch, tmp_path):
     """The window of the cubes, its canvas, and a function that draws with keys and buttons pressed and returns the commands."""
-    canvas, requests, marks = FakeCanvas(), Requests(), marks_of(cubes.scene)
+    canvas, requests, drawn = FakeCanvas(), Requests(), sampled(cubes)
     monkeypatch.setattr("taisoft.view.screen.Canvas", lambda *_, **__: canvas)
     monkeypatch.chdir(tmp_path)
-    description = describe_scene(cubes.scene, marks)
-    mirror = MirrorSimulation(description, len(cubes.positions()))
-    mirror.take(describe_state(cubes, marks, set()) | {"colour": "body"}, cubes.positions(), np.zeros(0))
     shown = {"colour": "body", "layers": ("fixed_nodes",), "controls": True, "pairs": touching_pairs(cubes)}
-    screen, state = Screen(mirror, description | shown, requests), state_of(Controls(cubes)) | {"status": "", "messages": []}
+    screen, state = Screen(drawn.scene, shown, requests), state_of(Controls(cubes)) | {"status": "", "messages": []}
 
     def act(keys=(), buttons=(), cursor=(0.9, 0.1)):
         canvas.keys, canvas.buttons, canvas.cursor = keys, buttons, cursor
-        screen.draw(mirror, state, 0.0)
+        screen.draw(drawn, state, 0.0)
         return requests.take()
 
     return screen, canvas, act

@@ -8,16 +8,17 @@ import pytest
 import taisoft as ts
 from taisoft.errors import OutputError
 from taisoft.nested import from_json, to_json
-from taisoft.output.viewpoint import framed_points
+from taisoft.output.viewpoint import camera_viewpoint, framed_points
 from taisoft.records import StepReport
 from taisoft.scene.checks import store
 from taisoft.scene.plan import Plan
 from taisoft.view import pictures
+from taisoft.view.drawn import DrawnScene
 from taisoft.view.link import Link, LinkClosed, SharedNodes
-from taisoft.view.mirror import MirrorSimulation, describe_scene, describe_state
 from taisoft.view.pictures import MIN_PICTURES, SLOTS, PictureOptions, PictureProcess, open_pictures, picture_writer
 from taisoft.view.plots import Plots
-from tests.view.drawing import connected_scene, marks_of, moving_scene, program
+from taisoft.view.sampling import Sampler
+from tests.view.drawing import connected_scene, moving_scene, program, sampled, travelled
 from tests.view.fake_simulator import FakeSimulator, beam_scene
 
 SIZE = (160, 90)
@@ -42,10 +43,10 @@ def test_messages_keep_their_data():
 def test_both_ends():
     link, other = Link.pair(5, slots=2)
     far = Link(other, SharedNodes(5, 2, os.dup(link.nodes.descriptor)))
-    link.nodes.x[1], link.nodes.values[0] = np.arange(15.0).reshape(5, 3), np.arange(5.0)
-    for name in ("x", "values"):
+    link.nodes.displacement[1], link.nodes.values[0] = np.arange(15.0).reshape(5, 3), np.arange(5.0)
+    for name in ("displacement", "values"):
         assert np.array_equal(getattr(far.nodes, name), getattr(link.nodes, name))
-    assert not far.nodes.x[0].any() and not far.nodes.values[1].any() and link.receive() is None
+    assert not far.nodes.displacement[0].any() and not far.nodes.values[1].any() and link.receive() is None
     link.send({"time": 1.0})
     assert far.receive(None) == {"time": 1.0}
     far.send({"commands": [["pause"]]})
@@ -59,38 +60,40 @@ def test_both_ends():
 
 def test_only_what_is_shown_travels():
     sim = FakeSimulator(moving_scene())
-    marks, x = marks_of(sim.scene), sim.positions()
-    state = describe_state(sim, marks, set())
-    assert "contacts" not in state and state["tractions"] == []
-    state = sent(describe_state(sim, marks, {"tractions"}) | {"colour": "body"})
-    assert state["tractions"][0].tolist() == [0.0, 0.0, 50.0]
-    mirror = MirrorSimulation(sent(describe_scene(sim.scene, marks)), len(x))
-    mirror.take(state, x, np.zeros(0))
-    assert mirror.nodal_values is None
-    mirror.take(state | {"colour": "stress"}, x, np.arange(float(len(x))))
-    assert mirror.values_of("speed") is None and mirror.values_of("stress")[-1] == len(x) - 1
-    assert np.array_equal(mirror.positions("two"), sim.positions("two")) and mirror.energies() == sim.energies()
+    state = sampled(sim)
+    assert state.contacts == {} and state.tractions == [] and state.values == {}
+    state = sampled(sim, {"tractions"}, "stress", "body")
+    assert state.tractions[0].tolist() == [0.0, 0.0, 50.0] and list(state.values) == ["stress"]
+    assert np.allclose(state.positions("two"), sim.positions("two"), atol=1e-6) and state.energies["elastic"] == 2.0
+    assert list(state.poses) == ["ball", "wall"]
     store(sim.scene.obstacle("rod"), path=lambda t: ((0, 0.25, 0), np.eye(3)))  # as a command does
-    mirror.take(describe_state(sim, marks, set()) | {"colour": "body"}, x, np.zeros(0))
-    assert mirror.scene.obstacles[2].pose(0.0)[0].tolist() == [0.0, 0.25, 0.0]
+    assert sampled(sim).poses["rod"][0].tolist() == [0.0, 0.25, 0.0]
     sim.scene.add_obstacle(ts.Sphere((9, 0, 0), 0.1), name="late", path=lambda t: ((1.0 / (1.0 - t), 0, 0), np.eye(3)))
     sim.time = 1.0
     with pytest.raises(OutputError, match="the scene cannot be shown: obstacle 'late': the path must give"):
-        describe_state(sim, marks_of(sim.scene), set())
+        sampled(sim)
 
 
-def test_both_frame_the_same_fall():
-    """Of one body; the others are held, prescribed or connected."""
+def test_a_scene_travels_whole():
+    """What is framed: of five bodies one falls, the others are held, prescribed or connected."""
     scene = beam_scene(("held", "moved", "one", "two", "three"))
-    scene.up = "z"
+    scene.up, scene.background = "z", ("#ffffff", "#000000")
+    scene.lights, scene.camera = [ts.Light((0, -1, 0))], ts.Camera((1, 2, 3), fov=[20, 30], times=[0, 1], follow="one")
+    scene.body("held").colour, scene.body("moved").opacity = "#ff0000", 0.5
     for body in scene.bodies[1:]:
         body.constraints.clear()
     scene.body("moved").move([0], lambda t: (0, t, 0))
     scene.add_spring(("one", 0), ("two", 0), 1.0)
-    scene.add_obstacle(ts.HalfSpace((0, -2, 0), (0, 1, 0)))
-    mirrored = MirrorSimulation(sent(describe_scene(scene, marks_of(scene))), 0).scene
-    seen = framed_points(mirrored)
-    assert mirrored.up == "z" and len(seen) == 6 * scene.bodies[0].n_nodes and np.array_equal(seen, framed_points(scene))
+    scene.add_obstacle(ts.HalfSpace((0, -2, 0), (0, 1, 0)), colour=(0, 0, 1), opacity=0.25)
+    seen = travelled(DrawnScene.of(scene))
+    assert seen.up == "z" and len(seen.framed) == 6 * scene.bodies[0].n_nodes
+    assert np.array_equal(seen.framed, framed_points(scene)) and np.array_equal(seen.background, scene.background)
+    assert seen.bodies[0].colour.tolist() == [1, 0, 0] and (seen.bodies[1].opacity, seen.obstacles[0].opacity) == (0.5, 0.25)
+    assert seen.obstacles[0].colour.tolist() == [0, 0, 1] and seen.lights[0].direction.tolist() == [0, -1, 0]
+    x = seen.start + np.repeat(np.array([0, 0, 1, 0, 0]), scene.bodies[0].n_nodes)[:, None]
+    cameras = [camera_viewpoint(one, 0.5, x) for one in (scene, seen)]
+    assert cameras[0].fov == cameras[1].fov and np.array_equal(cameras[0].position, cameras[1].position)
+    assert np.allclose(cameras[0].target, 1.0), "it follows the body"
 
 
 class Shown(FakeSimulator):
@@ -122,14 +125,16 @@ def test_both_ways_write_the_same_bytes(name, tmp_path):
     build, options = CASES[name]
     sim, n = Shown(build()), SLOTS + 4
     plots = Plots(sim, options.plots)
-    between = picture_writer(tmp_path / "between", sim.scene, options, plots)
-    beside = PictureProcess(tmp_path / "beside", sim, options, plots)
+    sampler = Sampler(sim.scene)
+    between = picture_writer(tmp_path / "between", sampler.drawn, options, plots)
+    beside = PictureProcess(tmp_path / "beside", sampler.drawn, options, plots)
     assert os.getsid(beside.pid) == beside.pid, "a session of its own: Ctrl-C goes to the run"
     for index in range(n):
         sim.time = 0.1 * index
         plots.take(StepReport(time=sim.time, kinetic=sim.time, n_contacts=index), 0.01)
-        between.frame(sim, index)
-        beside.frame(sim, index)
+        state = sampler.state(sim, options.layers, [options.colour])
+        between.frame(state, index)
+        beside.frame(state, index)
     beside.flush()
     kept = [[writer.kept(t) for t in (sim.time, sim.time + 1.0)] for writer in (between, beside)]
     assert kept[0] == kept[1] and kept[0][1]["camera"] > 0.0
@@ -142,7 +147,7 @@ def test_both_ways_write_the_same_bytes(name, tmp_path):
     assert [a.name for a, b in zip(own, other) if a.read_bytes() != b.read_bytes()] == []
     assert len({path.read_bytes() for path in own}) == n, "the pictures differ from each other"
     with pytest.raises(OutputError, match=r"^picture 1 cannot be written to .*frames: its writer is closed$"):
-        beside.frame(sim, 1)
+        beside.frame(state, 1)
 
 
 FAILING = """
@@ -164,12 +169,12 @@ serve(Drawing, *map(int, sys.argv[1:]))
 def test_an_error_is_raised_once_it_is_known(tmp_path):
     """Of the real process, at its third picture."""
     message = "^the drawing of pictures failed: not enough memory for a picture: 3 GB; available: .*$"
-    sim = FakeSimulator(beam_scene())
-    writer = PictureProcess(tmp_path, sim, PictureOptions(SIZE), child=program(FAILING))
+    state = sampled(FakeSimulator(beam_scene()))
+    writer = PictureProcess(tmp_path, state.scene, PictureOptions(SIZE), child=program(FAILING))
     with pytest.raises(OutputError, match=message):
         for index in range(10_000):
-            writer.frame(sim, index)
-    for use in (writer.flush, lambda: writer.frame(sim, 0), writer.close):
+            writer.frame(state, index)
+    for use in (writer.flush, lambda: writer.frame(state, 0), writer.close):
         with pytest.raises(OutputError, match=message):
             use()
     assert not (tmp_path / "frames/00003.png").exists()
@@ -177,11 +182,11 @@ def test_an_error_is_raised_once_it_is_known(tmp_path):
 
 def test_few_pictures_or_a_single_core_need_no_process(tmp_path, monkeypatch):
     """And a process that cannot be started is an error."""
-    sim = FakeSimulator(beam_scene())
+    scene = DrawnScene.of(beam_scene())
     monkeypatch.setattr("sys.executable", str(tmp_path / "absent"))
     for missing, cores in ((1, 2), (0, 1)):
         monkeypatch.setattr(pictures, "usable_cores", lambda cores=cores: list(range(cores)))
-        open_pictures(tmp_path, sim, PictureOptions(SIZE), None, MIN_PICTURES - missing).close()
+        open_pictures(tmp_path, scene, PictureOptions(SIZE), None, MIN_PICTURES - missing).close()
     monkeypatch.setattr(pictures, "usable_cores", lambda: [0, 1])
     with pytest.raises(OutputError, match="^the drawing of pictures failed: its process cannot be started: No such file"):
-        open_pictures(tmp_path, sim, PictureOptions(SIZE), None, MIN_PICTURES)
+        open_pictures(tmp_path, scene, PictureOptions(SIZE), None, MIN_PICTURES)

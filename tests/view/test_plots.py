@@ -18,7 +18,7 @@ from taisoft.view.plots import PLOTS, QUANTITIES, History, Plots, curves_of, pla
 from taisoft.view.scene_view import Surfaces
 from tests.cli.command import BEAM, run, write
 from tests.output.png import decode
-from tests.view.drawing import body_mask
+from tests.view.drawing import body_mask, sampled
 from tests.view.fake_simulator import FakeSimulator, beam_scene
 
 
@@ -209,11 +209,12 @@ def test_lines_show_their_values():
 def test_a_caption_is_at_the_bottom(monkeypatch):
     sim = FakeSimulator(beam_scene())
     sim.time = 0.5
-    plain = Annotations(name="bücher").draw(grey(), sim, 7)
+    state = sampled(sim)
+    plain = Annotations(name="bücher").draw(grey(), state, 7)
     left, top, right, bottom = bounds(plain, grey())
     assert left < 12 and 190 < right < 340 and 318 < top < 336 and bottom <= 355
-    assert not np.array_equal(Annotations(name="bücher").draw(grey(), sim, 8), plain), "frame number"
-    both = Annotations(filled(), "beam").draw(grey(), sim, 0)
+    assert not np.array_equal(Annotations(name="bücher").draw(grey(), state, 8), plain), "frame number"
+    both = Annotations(filled(), "beam").draw(grey(), state, 0)
     assert (both[10:280, : SIZE[0] - 160] == 120).all(), "the bodies stay visible"
     monkeypatch.setattr(annotations, "find_spec", lambda name: None if name == "PIL" else 1)
     with pytest.raises(OutputError, match=r"text in pictures needs Pillow: pip install 'taisoft\[plot\]'"):
@@ -222,22 +223,23 @@ def test_a_caption_is_at_the_bottom(monkeypatch):
 
 def test_a_colour_bar_follows_the_scale_and_fits_a_small_picture():
     sim = FakeSimulator(beam_scene())
-    colouring = Colouring(sim.scene, Surfaces(sim.scene), "stress")
+    colouring = Colouring(Surfaces(sim.scene), "stress")
     bar_alone, pictures = Annotations(colouring=colouring), []
-    assert np.array_equal(bar_alone.draw(grey(LARGE), sim, 0), grey(LARGE)), "no scale yet"
+    assert np.array_equal(bar_alone.draw(grey(LARGE), None, 0), grey(LARGE)), "no scale yet"
     for sim.time in (0.0, 0.0, 9.0):
-        colouring.base(sim)
-        pictures.append(bar_alone.draw(grey(LARGE), sim, 0))
+        state = sampled(sim, (), "stress")
+        colouring.base(state)
+        pictures.append(bar_alone.draw(grey(LARGE), state, 0))
     left, top, right, bottom = bounds(pictures[0], grey(LARGE))
     assert 8 < left < 18 and 230 < right < 252 and 640 < top and bottom <= 704
     bar = pictures[0][681, 16:236]
     assert np.abs(bar[[0, 110, -1]] - 255 * COLOURS[[0, 2, -1]]).max() < 6
     assert np.array_equal(pictures[0], pictures[1]) and not np.array_equal(pictures[1], pictures[2])
     assert np.array_equal(pictures[2][681, 16:236], bar), "only the numbers differ"
-    both = Annotations(name="beam", colouring=colouring).draw(grey(LARGE), sim, 0)
+    both = Annotations(name="beam", colouring=colouring).draw(grey(LARGE), state, 0)
     assert np.array_equal(both[681 - 60, 16:236], bar), "above the caption"
     small = grey((64, 36))  # where the steps of the bar are narrower than a pixel
-    assert (bar_alone.draw(small, sim, 7) != small).any()
+    assert (bar_alone.draw(small, state, 7) != small).any()
 
 
 def test_a_run_draws_plots_and_captions(tmp_path):

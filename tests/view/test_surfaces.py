@@ -6,14 +6,14 @@ import pytest
 import taisoft as ts
 from taisoft.output.viewpoint import Viewpoint
 from taisoft.scene.key_frames import KeyFrames
+from taisoft.view.drawn import DrawnScene
 from taisoft.view.ground import Square, finite_points
-from taisoft.view.mirror import MirrorSimulation, describe_scene, describe_state
 from taisoft.view.offscreen import Offscreen
 from taisoft.view.picking import MouseDrag, nearest_hit, pick
 from taisoft.view.scene_view import MARKER_COLOUR, Layers, Surfaces, smoothing_groups, vertex_normals
 from taisoft.view.shadow import Shadows, blurred
 from taisoft.view.window_shadow import ShadowMesh
-from tests.view.drawing import marks_of
+from tests.view.drawing import sampled
 from tests.view.fake_simulator import RUBBER, FakeSimulator, beam_scene
 
 
@@ -33,9 +33,9 @@ def test_edges_of_a_box_are_sharp_and_a_ball_is_smooth():
 def test_drawn_surface_follows_the_body_and_marks_fixed_nodes(order):
     scene = beam_scene(("one", "two"), order=order)
     surfaces, sim = Surfaces(scene), FakeSimulator(scene)
-    x, normals = surfaces.of_bodies(sim)
+    x, normals = surfaces.of_bodies(sampled(sim))
     sim.time = 1.0
-    moved, _ = surfaces.of_bodies(sim)
+    moved, _ = surfaces.of_bodies(sampled(sim))
     assert len(x) == len(normals) == len(surfaces.colours)
     assert surfaces.triangles.min() == 0 and surfaces.triangles.max() == len(x) - 1
     assert (moved[:, 1] <= x[:, 1] + 1e-12).all() and (x[:, 1] - moved[:, 1]).max() > 1.0
@@ -95,10 +95,13 @@ def cube_above(height, normal=(0.0, 1.0, 0.0), path=None):
 def maps_of(scene, bad=None, t=0.0):
     """Shadow maps and their texels; bad: vertices that are not finite."""
     surfaces = Surfaces(scene)
-    x, _ = surfaces.with_obstacles(surfaces.of_bodies(FakeSimulator(scene)), t, np.array([0.0, 9.0, 9.0]))
+    sim = FakeSimulator(scene)
+    sim.time = t
+    state = sampled(sim)
+    x, _ = surfaces.with_obstacles(surfaces.of_bodies(state), state, np.array([0.0, 9.0, 9.0]))
     if bad is not None:
         x[bad] = np.nan
-    return Shadows(scene, surfaces).draw(x, t)
+    return Shadows(state.scene, surfaces).draw(x, state.poses)
 
 
 def test_the_ground_is_darker_below_a_body():
@@ -138,9 +141,10 @@ def test_shadows_on_slopes_and_moving_half_spaces_and_of_nodes_that_are_not_fini
 def test_the_window_has_the_shadow_as_a_mesh_on_the_ground():
     scene = cube_above(0.1)
     surfaces = Surfaces(scene)
-    x, _ = surfaces.with_obstacles(surfaces.of_bodies(FakeSimulator(scene)), 0.0, ABOVE.position)
-    mesh = ShadowMesh(scene, surfaces)
-    points, colours, triangles = mesh.draw(x, 0.0, ABOVE)
+    state = sampled(FakeSimulator(scene))
+    x, _ = surfaces.with_obstacles(surfaces.of_bodies(state), state, ABOVE.position)
+    mesh = ShadowMesh(state.scene, surfaces)
+    points, colours, triangles = mesh.draw(x, state.poses, ABOVE)
     assert len(points) == len(colours) == mesh.size[0] and len(triangles) <= mesh.size[1]
     rays = points - ABOVE.position  # they lie a little nearer to the eye
     on_ground = ABOVE.position - rays * (ABOVE.position[1] / rays[:, 1:2])
@@ -183,12 +187,12 @@ def ball_in_a_cube(cells, size, order):
     [(beam_scene, (*TWO, 1)), (beam_scene, (*TWO, 2)), (ball_in_a_cube, (12, 1.0, 1)), (ball_in_a_cube, (1, 0.8, 2))],
 )  # the last one's tets do not hold all of the skin
 def test_cursor_picks_and_drags_a_body(build, arguments):
-    """Deformed, and as the mirror in the window's process sees it."""
+    """Deformed, and as the window's process sees it."""
     scene, size = build(*arguments), (1600, 900)
-    real, marks, body = FakeSimulator(scene), marks_of(scene), scene.bodies[-1]
-    real.time, n = 1.0, sum(body.n_nodes for body in scene.bodies)
-    sim, camera, x = MirrorSimulation(describe_scene(scene, marks), n), Viewpoint.framing(real.positions()), real.positions("two")
-    sim.take(describe_state(real, marks, set()) | {"colour": "body"}, real.positions(), np.zeros(n))
+    real, body = FakeSimulator(scene), scene.bodies[-1]
+    real.time = 1.0
+    sim, camera = sampled(real), Viewpoint.framing(real.positions())
+    x = sim.positions("two")
     skin = body.riding_skin
     shown, triangles = (x, body.nodes.surface) if skin is None else (skin.weights @ x, skin.surface.triangles)
     centres = shown[triangles].mean(axis=1)
@@ -228,7 +232,7 @@ def test_lines_of_layers():
     counts = {"wires": 3 * len(scene.bodies[0].mesh.surface) // 2, "contacts": 2, "tractions": 3 * loaded, "fixed_nodes": 0}
     for name, count in counts.items():
         layers.shown = {other: other == name for other in layers.shown}
-        found[name], colours = layers.lines(sim, camera)
+        found[name], colours = layers.lines(sampled(sim, [name]), camera)
         assert len(found[name]) == len(colours) == 2 * count <= 2 * layers.n_segments
     nodes, drawn = (camera.project(points, (200, 100))[:, :2] for points in (sim.positions(), found["wires"]))
     assert np.linalg.norm(drawn[:, None] - nodes, axis=2).min(axis=1).max() < 1e-9, "wires end at nodes"
@@ -241,10 +245,10 @@ def test_strokes_lie_in_triangles_along_deformed_fibres():
     scene, (mesh, a) = ts.Scene(), (ts.box_mesh((2, 1, 1), (1, 0.4, 0.4)), np.array([0.6, 0.8, 0.0]))
     scene.add_body(mesh, RUBBER, name="plain", position=(0, 3, 0))
     scene.add_body(mesh, ts.Material(active_stress=1.0), name="muscle", fibres=a)
-    [(nodes, weights)] = marks_of(scene).strokes
+    (nodes, weights), first = DrawnScene.of(scene).bodies[1].strokes, len(mesh.vertices)
     F = np.array([[1.2, 0.3, 0.0], [0.0, 0.9, 0.1], [0.2, 0.0, 1.1]])
     x = np.concatenate([mesh.vertices, mesh.vertices @ F.T])
-    ends, corners = weights @ x[nodes], (mesh.vertices @ F.T)[mesh.surface]
+    ends, corners = weights @ x[first + nodes], (mesh.vertices @ F.T)[mesh.surface]
     assert np.allclose(ends.mean(axis=1), corners.mean(axis=1))
     p, q, r = (mesh.vertices[mesh.surface[:, k]] for k in range(3))
     normal = np.cross(q - p, r - p)

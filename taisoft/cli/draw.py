@@ -1,0 +1,68 @@
+"""`taisoft draw DIR`: draw a finished run again from the states in its folder, in another look, without computing."""
+
+import json
+from argparse import Namespace
+from contextlib import closing, suppress
+from dataclasses import replace
+from pathlib import Path
+
+from taisoft.cli import EXIT_SIGNAL, Signals
+from taisoft.cli.pictures import camera_of, picture_options, slowness
+from taisoft.cli.recording import has_bar, make_video
+from taisoft.errors import SceneError, reworded
+from taisoft.output.files import OutputFolder
+from taisoft.output.report import frame_rate
+from taisoft.scene.look import background_of, check_follow
+from taisoft.view.pictures import picture_writer
+from taisoft.view.states import StoredRun
+
+FOLDER = "drawn"  # in the run's folder
+
+
+def draw(arguments: Namespace) -> int:
+    """Draw the run and return the exit status. Bad input is refused before any file is written."""
+    with Signals("ending with the pictures drawn so far") as signals:
+        run, out = StoredRun(arguments.scene), Path(arguments.out or Path(arguments.scene) / FOLDER)
+        if out.resolve() == run.folder.resolve():
+            raise SceneError(
+                f"--out {out}: it is the folder of the run itself: name another, or leave it out for {run.folder / FOLDER}"
+            )
+        options, slow = picture_options(arguments), slowness(arguments)
+        run.check_colour(options.colour)
+        if arguments.camera is not None:
+            run.scene.camera = camera_of(arguments.camera)
+            check_follow(run.scene.camera, run.scene.bodies)
+        for assignment in arguments.assignments:
+            _set(run, assignment)
+        fps = frame_rate(run.folder) if arguments.video else 0.0
+        with closing(OutputFolder(out, arguments.overwrite)) as folder:
+            signals.run_began()
+            writer = picture_writer(folder.path, run.scene, replace(options, bar=has_bar(options.colour)))
+            drawn = 0
+            with closing(writer):
+                for index in run.frames:
+                    writer.frame(run.state(index), index)
+                    drawn += 1
+                    if signals.requested():
+                        break
+            if arguments.video and not signals.requested():
+                make_video(folder.path, fps / slow)
+            folder.discard_stale()
+        print(f"pictures {out / 'frames'}/ ({drawn} of {len(run)} frames of {run.folder})")
+    return 0 if signals.number is None else EXIT_SIGNAL + signals.number
+
+
+def _set(run: StoredRun, assignment: str) -> None:
+    """Change the look as --set NAME.colour=VALUE, NAME.opacity=VALUE or scene.background=VALUE says. Raises SceneError."""
+    name, equals, text = (part.strip() for part in assignment.partition("="))
+    owner, _, key = name.rpartition(".")
+    value = text.strip("'\"")
+    with suppress(ValueError):
+        value = json.loads(text)
+    with reworded(SceneError, f"--set {assignment}: "):
+        if name == "scene.background":
+            run.scene.background = background_of(value)
+        elif equals and owner and key in ("colour", "opacity"):
+            run.paint(owner, **{key: value})
+        else:
+            raise SceneError("write NAME.colour='#rrggbb', NAME.opacity=NUMBER or scene.background='#rrggbb'")

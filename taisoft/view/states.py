@@ -1,0 +1,167 @@
+"""States of a run in its folder: `states/scene.npz`, what is drawn of the scene, and `states/00000.npz ...`, one for each frame.
+
+`taisoft draw` and `StoredRun` draw a finished run from them, without computing. A file holds arrays without pickled objects, and
+`header`, JSON text of all else. Each file is complete or absent.
+"""
+
+import json
+from collections import deque
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack, contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from taisoft.errors import OutputError, TaisoftError, reason
+from taisoft.files import replacing
+from taisoft.nested import join_arrays, part_arrays
+from taisoft.output.files import make_folder
+from taisoft.scene.checks import index
+from taisoft.scene.look import Camera, colour_of, opacity_of
+from taisoft.view.colouring import checked_colour
+from taisoft.view.drawn import DrawnScene, DrawnState
+from taisoft.view.offscreen import SIZE, Offscreen
+from taisoft.view.sampling import Sampler
+from taisoft.view.scene_view import LAYERS
+
+STATES_NAME, SCENE_NAME = "states", "scene.npz"
+WAITING = 8  # states that are not written yet
+FORMAT = 1  # increment it with every change of a file's content
+KEPT = ("stress", "speed")  # quantities that a run keeps by default
+DISPLACEMENT, VALUES = "displacement", "values"  # arrays over the nodes; the latter followed by a quantity's name
+
+
+class StateWriter:
+    """Observer that samples every frame once, writes its state to the run's folder, and passes it on.
+
+    kinds: quantities that are kept, besides positions; None: no states are written. members: get `frame(state, index)`; shown:
+    layers and colour that they show. Files are written in a thread; what fails in it raises OutputError at a later call.
+    """
+
+    def __init__(self, folder: str | Path, sampler: Sampler, kinds: Sequence[str] | None, members: Sequence, shown: tuple):
+        self._sampler, self._members, self._folder = sampler, members, None if kinds is None else Path(folder) / STATES_NAME
+        self._layers, self._kinds = (shown[0] if kinds is None else LAYERS), list(dict.fromkeys([*(kinds or ()), shown[1]]))
+        self._pool, self._pending = ThreadPoolExecutor(1, "states"), deque()
+        if self._folder is not None:
+            _write(make_folder(self._folder) / SCENE_NAME, sampler.drawn.plain(), {})
+
+    def frame(self, sim, index: int) -> None:
+        """Keep sim's present state as frame number index. Raises OutputError."""
+        layers = [one for one in self._layers if one != "contacts" or sim.plan.on["contact_forces"]]
+        state = self._sampler.state(sim, layers, self._kinds)
+        if self._folder is not None:
+            values = {f"{VALUES}/{kind}": one for kind, one in state.values.items()}
+            path, arrays = self._folder / f"{index:05d}.npz", {DISPLACEMENT: state.displacement} | values
+            self._pending.append(self._pool.submit(_write, path, state.plain(), arrays))
+            self._wait(WAITING)
+        for member in self._members:
+            member.frame(state, index)
+
+    def _wait(self, most: int) -> None:
+        """Wait until at most so many files are not written yet. Raises OutputError."""
+        while len(self._pending) > most:
+            self._pending.popleft().result()
+
+    def flush(self) -> None:
+        """Wait until all states are written. Raises OutputError."""
+        self._wait(0)
+
+    def close(self) -> None:
+        """Write the states that wait, and close the members; a second call does nothing. Raises OutputError."""
+        with ExitStack() as stack:
+            for close in (self._pool.shutdown, *(member.close for member in self._members)):
+                stack.callback(close)
+            self.flush()
+
+
+class StoredRun:
+    """A run in a folder, drawn again without computing.
+
+    folder: of `taisoft run --out`. scene: what is drawn of its scene, of which `background`, `lights` and `camera` can be set;
+    frames: numbers of its frames. Raises OutputError if there are no states, or they cannot be read.
+    """
+
+    def __init__(self, folder: str | Path):
+        self.folder = Path(folder)
+        states = self.folder / STATES_NAME
+        self.frames = sorted(int(path.stem) for path in states.glob("*.npz") if path.stem.isdecimal())
+        if not self.frames or not (states / SCENE_NAME).exists():
+            raise OutputError(
+                f"{states}: there are no states of a run: `taisoft run SCENE --out DIR` keeps them, but not with --keep none"
+            )
+        with _reading(states / SCENE_NAME):
+            self.scene = DrawnScene.from_plain(_read(states / SCENE_NAME)[0])
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    def __repr__(self) -> str:
+        return f"StoredRun({str(self.folder)!r}, {len(self)} frames)"
+
+    def state(self, frame: int) -> DrawnState:
+        """Return the state of a frame, by its number. Raises OutputError."""
+        if frame not in self.frames:
+            raise OutputError(f"{self.folder}: there is no frame {frame!r}: they are {self.frames[0]} to {self.frames[-1]}")
+        path = self.folder / STATES_NAME / f"{frame:05d}.npz"
+        with _reading(path):
+            given, arrays = _read(path)
+            values = {name.removeprefix(f"{VALUES}/"): one for name, one in arrays.items() if name.startswith(f"{VALUES}/")}
+            return DrawnState(self.scene, displacement=arrays[DISPLACEMENT], values=values, **given)
+
+    def check_colour(self, kind: str) -> str:
+        """Return the name of a colouring. Raises OutputError if it is unknown, or the run has not kept what it needs."""
+        kept = self.state(self.frames[0]).values
+        if checked_colour(kind) != "body" and kind not in kept:
+            has = f"has kept {', '.join(kept)}" if kept else "has kept positions alone"
+            raise OutputError(f"{self.folder}: colour {kind!r} cannot be drawn: the run {has}; run it again with --keep {kind}")
+        return kind
+
+    def paint(self, name: str, colour=None, opacity: float | None = None) -> None:
+        """Give a body or an obstacle another colour or opacity, as of `Scene.add_body`. Raises SceneError."""
+        scene, what = self.scene, f"{name!r}"
+        ones = [*scene.bodies, *scene.obstacles]
+        k = index(name, [one.name for one in ones], "no body or obstacle")
+        given = {} if colour is None else {"colour": colour_of(colour, f"{what}: colour")}
+        given |= {} if opacity is None else {"opacity": opacity_of(opacity, f"{what}: opacity")}
+        owner, at = (scene.bodies, k) if k < len(scene.bodies) else (scene.obstacles, k - len(scene.bodies))
+        owner[at] = replace(owner[at], **given)
+
+    def picture(
+        self, frame: int | None = None, size: tuple[int, int] = SIZE, colour: str = "body", camera: Camera | None = None
+    ) -> np.ndarray:
+        """Return a picture of a frame, by default the last, uint8 (height, width, 3); arguments as for `Simulator.picture`.
+
+        The automatic camera frames the start, and the scale is the frame's own. Raises OutputError.
+        """
+        state = self.state(self.frames[-1] if frame is None else frame)
+        return Offscreen(self.scene, size, camera, self.check_colour(colour)).image(state)
+
+
+@contextmanager
+def _reading(path: Path) -> Iterator[None]:
+    """Turn what NumPy, zipfile and the content of a file raise into an OutputError."""
+    try:
+        yield
+    except TaisoftError:
+        raise
+    except Exception as error:
+        raise OutputError(f"{path} is no state of a run, or damaged: {reason(error)}") from None
+
+
+def _write(path: Path, given: dict, arrays: dict[str, np.ndarray]) -> None:
+    arrays = dict(arrays)
+    header = json.dumps({"format": FORMAT, "content": part_arrays(given, arrays)})
+    with replacing(path) as part, open(part, "wb") as file:
+        np.savez(file, header=np.frombuffer(header.encode(), dtype=np.uint8), **arrays)
+
+
+def _read(path: Path) -> tuple[dict, dict[str, np.ndarray]]:
+    """Return what `_write` wrote. Raises OutputError for another format."""
+    with np.load(path, allow_pickle=False) as file:
+        arrays = {name: file[name] for name in file.files}
+    header = json.loads(arrays.pop("header").tobytes())
+    if header["format"] != FORMAT:
+        raise OutputError(f"{path} has format {header['format']}, and this version reads format {FORMAT}")
+    return join_arrays(header["content"], arrays), arrays
