@@ -1,7 +1,7 @@
 """What the live window changes in a simulation: dt, gravity, materials, friction, solver, and the drag with the mouse.
 
-All of them but the solver are run-time data, so nothing is recompiled. Young's modulus and density are multiplied by a power of
-ten that the sliders set, so that regions and tets keep their ratios.
+All of them but the solver are run-time data, so nothing is recompiled. Young's modulus and density are multiplied by a factor,
+so that regions and tets keep their ratios.
 """
 
 import itertools
@@ -41,7 +41,7 @@ class Controls:
         self._names = [body.name for body in scene.bodies]
         self._initial = {what: {body.name: getattr(body, what) for body in elastic} for what in DECADES}
         self._stiffnesses = {body.name: body.composition.stiffnesses for body in elastic}
-        self._exponents = {what: dict.fromkeys(self._initial[what], 0.0) for what in DECADES}
+        self._factors = {what: dict.fromkeys(self._initial[what], 1.0) for what in DECADES}
         self._pairs = touching_pairs(sim)
         self._frictions: list[float] | None = None  # of the pairs; None if unknown
         self._held: tuple | None = None  # body, nodes and weights of the present drag
@@ -66,12 +66,12 @@ class Controls:
         }
 
     def _range(self, what: str, name: str) -> tuple[float, float, float] | None:
-        """Return the least and the largest value of a number of a body, and the exponent of its factor; None if it is rigid."""
+        """Return the least and the largest value of a number of a body, and its factor; None if it is rigid."""
         if name not in self._initial[what]:
             return None
-        exponent = self._exponents[what][name]
-        present = self._initial[what][name] * 10.0**exponent
-        return float(np.min(present)), float(np.max(present)), exponent
+        factor = self._factors[what][name]
+        present = self._initial[what][name] * factor
+        return float(np.min(present)), float(np.max(present)), factor
 
     def _dt_ends(self) -> tuple[float, float]:
         sim = self._sim
@@ -94,15 +94,15 @@ class Controls:
         self._sim.set_gravity(size * self._g_direction)
         self._g = size
 
-    def set_number(self, what: str, names: list[str], exponent: float) -> None:
-        """Multiply the initial young or density of elastic bodies by a power of ten; for young, all stiffnesses of a law.
+    def set_number(self, what: str, names: list[str], factor: float) -> None:
+        """Multiply the initial young or density of elastic bodies by a factor; for young, all stiffnesses of a law.
 
         An explicit dt is lowered if it would not be stable; the requested one is restored as soon as it is.
         """
         sim = self._sim
         for name in names:
             initial = {what: self._initial[what][name]} if what != "young" else self._stiffnesses[name]
-            numbers = {number: value * 10.0**exponent for number, value in initial.items()}
+            numbers = {number: value * factor for number, value in initial.items()}
             for k in range(HALVINGS):
                 try:
                     sim.set_material(name, **numbers)
@@ -111,7 +111,7 @@ class Controls:
                     if k == HALVINGS - 1:
                         raise
                     sim.dt = 0.5 * sim.dt
-            self._exponents[what][name] = exponent
+            self._factors[what][name] = factor
         self._restore_dt()
 
     def set_friction(self, k: int | None, friction: float) -> None:

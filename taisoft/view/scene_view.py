@@ -17,7 +17,7 @@ import numpy as np
 from taisoft.errors import OutputError
 from taisoft.mesh.topology import linked_groups, triangle_edges
 from taisoft.output.appearance import ObstacleSurface, ShownBodies, body_colours, obstacle_colour, obstacle_surfaces, subdivide
-from taisoft.output.viewpoint import MAX_WIDENING, Viewpoint, framed_points, start_positions
+from taisoft.output.viewpoint import MAX_WIDENING, WHOLE, Viewpoint, framed_points, start_positions
 from taisoft.scene.loads import value_at
 from taisoft.scene.obstacles import HalfSpace
 from taisoft.view.colouring import Colouring, lit_colours
@@ -61,17 +61,21 @@ class SceneView:
         values: Callable | None = None,
         marks=None,
     ):
-        self.camera = camera or Viewpoint.framing(framed_points(scene), size, up=scene.up)
+        self.camera = camera or Viewpoint.framing(framed_points(scene), size, self._free(size), up=scene.up)
         self._widest = 0.0 if camera else MAX_WIDENING * self.camera.distance  # largest automatic distance [m]; 0: fixed camera
         self.surfaces = Surfaces(scene)
         self.layers = Layers(scene, layers, marks)
         self.colouring = Colouring(scene, self.surfaces, colour, values)
 
+    def _free(self, size: tuple[int, int]) -> tuple[float, float, float, float]:
+        """Return the part of a picture of this size in which the bodies are framed, as for `Viewpoint.framing`."""
+        return WHOLE
+
     def _drawn(self, sim, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray, tuple[np.ndarray, np.ndarray]]:
         """Move the camera back if needed; return vertices and lit colours (n,3), and the lines of the layers."""
         self.surfaces.with_markers = self.layers.shown["fixed_nodes"]
         bodies = self.surfaces.of_bodies(sim)
-        self.camera = self.camera.widened(bodies[0], size, self._widest)
+        self.camera = self.camera.widened(bodies[0], size, self._widest, self._free(size))
         x, normals = self.surfaces.with_obstacles(bodies, sim.time, self.camera.position)
         colours = lit_colours(x, normals, self.colouring.base(sim), self.camera)
         return x, colours, self.layers.lines(sim, self.camera)

@@ -44,6 +44,7 @@ class Screen(SceneView):
     """
 
     def __init__(self, sim: MirrorSimulation, description: dict, requests: Requests):
+        self._panel_rectangle = PANEL if description["controls"] else SHORT_PANEL
         super().__init__(sim.scene, SIZE, None, description["colour"], tuple(description["layers"]), sim.values_of, sim)
         self.timing = Timing()
         self.layers.shown["shadows"] = True
@@ -52,7 +53,6 @@ class Screen(SceneView):
         if description["controls"]:
             names = [body.name for body in sim.scene.bodies]
             self._panel = Panel(names, description["pairs"], self.colouring, self.layers, requests)
-        self._panel_rectangle = PANEL if self._panel is not None else SHORT_PANEL
         self._cursor: tuple[float, float] | None = None  # at the last picture
         self._mode = ""  # of the present mouse drag: "turn", "zoom", "shift", "drag", or "panel", which GGUI handles
         self._follows, self._centre = False, None  # whether the camera follows the bodies; their last centre
@@ -98,7 +98,7 @@ class Screen(SceneView):
             for line in [state["status"], *state_lines(sim), *self.timing.lines(state)]:
                 gui.text(line)
             if self._panel is not None:
-                self._panel.draw(gui, state)
+                self._panel.draw(gui, state, held=self._mode == "panel")
         self._show_messages(window.get_gui(), state, age)
         window.show()
         self.timing.shown(state)
@@ -118,6 +118,9 @@ class Screen(SceneView):
 
     # --- camera -------------------------------------------------------------------------------------------------------
 
+    def _free(self, size: tuple[int, int]) -> tuple[float, float, float, float]:
+        return free_part(self._panel_rectangle, size)
+
     def _follow(self, sim: MirrorSimulation) -> None:
         """Move the camera's target with the mean position of the nodes, but not while a body is dragged."""
         x = sim.positions()
@@ -135,8 +138,8 @@ class Screen(SceneView):
         x = sim.positions()
         x = x[np.isfinite(x).all(axis=1)]
         if len(x):
-            kept = {name: getattr(self.camera, name) for name in ("up", "azimuth", "elevation")}
-            self.camera = Viewpoint.framing(x, size, **kept)
+            kept = {name: getattr(self.camera, name) for name in ("up", "azimuth", "elevation", "fov")}
+            self.camera = Viewpoint.framing(x, size, self._free(size), **kept)
             self._widest = MAX_WIDENING * self.camera.distance
 
     def _move_camera(self, right: float, up: float, size) -> None:
@@ -228,6 +231,12 @@ class Screen(SceneView):
             self._note.set(f"written: {path}")
         except OutputError as error:
             self._note.set(str(error))
+
+
+def free_part(panel: tuple[float, float, float, float], size: tuple[int, int]) -> tuple[float, float, float, float]:
+    """Return the part of a window right of its panel, but at least a quarter, as for `Viewpoint.framing`."""
+    left, _, width, _ = panel
+    return (min((left + width) * SIZE[0] / max(size[0], 1), 0.75), 0.0, 1.0, 1.0)
 
 
 def _contains(rectangle: tuple[float, float, float, float], x: float, y: float) -> bool:
