@@ -89,12 +89,6 @@ def camera_viewpoint(scene, t: float, x: np.ndarray) -> "Viewpoint | None":
     return Viewpoint(**at)
 
 
-def _middle(free: tuple, size: tuple[int, int]) -> tuple[float, float]:
-    """Return where the middle of a free part of a picture is, as `Viewpoint.shift`."""
-    left, bottom, right, top = free
-    return ((left + right - 1.0) / 2 * size[0] / size[1], (bottom + top - 1.0) / 2)
-
-
 def clip_polygon(polygon: np.ndarray, k: int = 0) -> np.ndarray:
     """Clip a convex polygon to the side of a plane where the height is not negative (Sutherland and Hodgman 1974).
 
@@ -114,8 +108,8 @@ class Viewpoint:
     """A camera aimed at target (3,) [m] from a distance [m].
 
     azimuth [deg] about up: 0 looks along -z (with z up: +y), 90 along -x; elevation [deg] above the horizon; fov [deg]: vertical
-    field of view; up: axis that points up, "y" or "z"; shift: where the target is in the picture, right of and above its middle,
-    in heights of the picture.
+    field of view; up: axis that points up, "y" or "z"; shift: how far the target is right of and above the picture's
+    middle, over the depth.
     """
 
     target: np.ndarray = field(default_factory=lambda: np.zeros(3))
@@ -134,18 +128,18 @@ class Viewpoint:
         target is in its middle, as deep as the middle of the points.
         """
         middle = (np.min(points, axis=0) + np.max(points, axis=0)) / 2
-        camera = cls(target=middle, shift=_middle(free, size), **angles)
-        x, depth = (points - middle) @ camera.axes[:2].T, ((points - middle) @ camera.forward)[:, None]
-        aim, half = camera._slopes(free, size, FILL)
+        camera = cls(target=middle, **angles)
+        local, (aim, half) = (points - middle) @ camera.axes.T, camera._slopes(free, size, FILL)
+        x, depth = local[:, :2], local[:, 2:]
         # points beside the target that the eye sees within aim +- half: |x - target - aim * depth| <= half * (depth + distance)
         low, high = (x - (aim + half) * depth).max(axis=0), (x - (aim - half) * depth).min(axis=0)
         distance = max(*((low - high) / (2.0 * half)), 1e-9)  # of a single point: above 0
-        return replace(camera, distance=float(distance), target=middle + (low + high) / 2 @ camera.axes[:2])
+        return replace(camera, target=middle + (low + high) / 2 @ camera.axes[:2], distance=float(distance), shift=tuple(aim))
 
     @property
     def position(self) -> np.ndarray:
         """Position of the eye (3,) [m]."""
-        return self.target - self.distance * (self.forward + 2 * self.slope * (np.array(self.shift) @ self.axes[:2]))
+        return self.target - self.distance * (self.forward + np.array(self.shift) @ self.axes[:2])
 
     @cached_property
     def forward(self) -> np.ndarray:
@@ -177,17 +171,15 @@ class Viewpoint:
         size, free: as for `framing`; the target moves to the middle of the part. Never moves nearer; points that are not finite
         are ignored.
         """
-        aim, half = self._slopes(free, size, 1.0 - BORDER)
-        x, depth = (points - self.target) @ self.axes[:2].T, ((points - self.target) @ self.forward)[:, None]
-        needed = np.abs(x - aim * depth) / half - depth
+        local, (aim, half) = (points - self.target) @ self.axes.T, self._slopes(free, size, 1.0 - BORDER)
+        needed = np.abs(local[:, :2] - aim * local[:, 2:]) / half - local[:, 2:]
         distance = float(np.max(needed, initial=0.0, where=np.isfinite(needed)))
-        return replace(self, distance=max(self.distance, min(distance, limit)), shift=_middle(free, size))
+        return replace(self, distance=max(self.distance, min(distance, limit)), shift=tuple(aim))
 
     def _slopes(self, free: tuple, size: tuple[int, int], fraction: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return the middle of a free part, and half of a fraction of its width and height, over the depth, (2,) each."""
-        left, bottom, right, top = free
-        sides = np.array([(right - left) * size[0] / size[1], top - bottom])
-        return 2 * self.slope * np.array(_middle(free, size)), self.slope * fraction * sides
+        """Return the middle of a free part, as `shift`, and half of a fraction of its width and height, (2,) over the depth."""
+        low, high = 2.0 * self.slope * (np.reshape(free, (2, 2)) - 0.5) * (size[0] / size[1], 1.0)
+        return (low + high) / 2, fraction * (high - low) / 2
 
     def clipped(
         self, x: np.ndarray, triangles: np.ndarray, attributes: np.ndarray, size: tuple[int, int]

@@ -12,7 +12,6 @@ from collections.abc import Callable
 from taisoft.dynamics.schemes import CHOICES
 from taisoft.settings import contact_solvers
 from taisoft.view.colouring import TITLES, Colouring, following
-from taisoft.view.controls import DECADES
 from taisoft.view.keys import KEYS
 from taisoft.view.scene_view import Layers
 
@@ -110,25 +109,17 @@ class Panel:
 
     # --- sliders ------------------------------------------------------------------------------------------------------
 
-    def _present(self, key: str, value: float) -> float:
-        """Return a slider's value: the one set until the simulation has answered."""
-        if key in self._set and self._set[key][1] <= self._state["answered"]:
-            del self._set[key]
-        return self._set[key][0] if key in self._set else value
+    def _slider(self, gui, name: str, text: str, value: float, limits, *command, unit="", least: float | None = None) -> float:
+        """Declare a slider, and request its change: a command and its arguments, of which the last is the new value.
 
-    def _slider(
-        self, gui, name: str, text: str, value: float, limits, *command, unit="", of="", least: float | None = None, per=1.0
-    ) -> float:
-        """Declare a slider, and request its change: a command and its arguments, of which the last is the new value over per.
-
-        of: what the value belongs to, if that changes; its key is name + of. least: of several values, of which this is the
-        largest. Returns the value shown.
+        least: of several values, of which this is the largest. Returns the value shown: the one set until the simulation answers.
         """
-        key = name + of
-        present = self._present(key, value)
-        if not self._held or key not in self._ranges:
-            self._ranges[key] = range_about(present, limits, unit)
-        low, high, shown_unit, scale = self._ranges[key]
+        if name in self._set and self._set[name][1] <= self._state["answered"]:
+            del self._set[name]
+        present = self._set[name][0] if name in self._set else value
+        if not self._held or name not in self._ranges:
+            self._ranges[name] = range_about(present, limits, unit)
+        low, high, shown_unit, scale = self._ranges[name]
         label = text + (f" [{shown_unit}]" if unit else "")
         if least is not None and f"{least:.4g}" != f"{value:.4g}":
             label += f" {least / scale:.3g} to {value / scale:.3g}"
@@ -138,26 +129,21 @@ class Panel:
             return present
         new = min(max(scale * new, limits[0]), max(limits[1], present))  # GGUI lets one type a number
         if command:
-            self._set[key] = (new, self._requests.next_number)
-            self._requests.add(*command, new / per, key=key)
+            self._set[name] = (new, self._requests.next_number)
+            self._requests.add(*command, new, key=name)
         return new
 
     def _materials(self, gui, values: dict) -> None:
-        """Declare sliders of Young's modulus and density, of the chosen body or of all."""
+        """Declare sliders of Young's modulus and density, of the chosen body or of all; they show those of the first one."""
         if len(self._bodies) > 1 and gui.button(("all bodies" if self._all_bodies else self.chosen) + "###which"):
             self._all_bodies = not self._all_bodies
-        shown = [self.chosen, *(self._bodies if self._all_bodies else ())]
-        for what in DECADES:
+        shown = dict.fromkeys([self.chosen, *(self._bodies if self._all_bodies else ())])
+        for what, title in TITLE.items():
             ranges = dict(zip(self._bodies, values[what]))
-            if known := [name for name in shown if ranges[name] is not None]:  # rigid bodies have none
-                self._material(gui, what, known, *ranges[known[0]])
-
-    def _material(self, gui, what: str, names: list[str], low: float, high: float, factor: float) -> None:
-        """Declare a slider of a number of bodies, which shows that of the first: the largest of its tets."""
-        initial, span = high / factor, 10.0 ** DECADES[what]
-        command = "set_number", what, [one for one in self._bodies if one in names]
-        more = {"unit": UNIT[what], "of": f" of {names[0]}", "least": low, "per": initial}
-        self._slider(gui, what, TITLE[what], high, (initial / span, initial * span), *command, **more)
+            if names := [name for name in shown if ranges[name] is not None]:  # rigid bodies have none
+                least, largest, *limits = ranges[names[0]]
+                command, more = ("set_number", what, names), {"unit": UNIT[what], "least": least}
+                self._slider(gui, f"{what} of {names[0]}", title, largest, limits, *command, **more)
 
     # --- sections -----------------------------------------------------------------------------------------------------
 

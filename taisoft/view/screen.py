@@ -27,6 +27,7 @@ SIZE = (1280, 720)
 PANEL = (0.012, 0.02, 0.31, 0.96)  # left, top, width, height as fractions of the window's initial size
 SHORT_PANEL = (0.012, 0.02, 0.31, 0.22)  # of a window without controls
 MESSAGES = (0.334, 0.87, 0.4, 0.11)
+ABOVE_MESSAGES = 0.04  # fraction of the window kept free below what is framed, beside its border
 ORBIT = 240.0  # angle for a drag over the whole window [deg]
 ZOOM = 16.0  # factor on the distance for a drag over the whole window
 DRAG_COLOUR = np.array([0.85, 0.10, 0.35])  # sRGB
@@ -236,7 +237,7 @@ class Screen(SceneView):
 def free_part(panel: tuple[float, float, float, float], size: tuple[int, int]) -> tuple[float, float, float, float]:
     """Return the part of a window right of its panel, but at least a quarter, as for `Viewpoint.framing`."""
     left, _, width, _ = panel
-    return (min((left + width) * SIZE[0] / max(size[0], 1), 0.75), 0.0, 1.0, 1.0)
+    return (min((left + width) * SIZE[0] / max(size[0], 1), 0.75), ABOVE_MESSAGES, 1.0, 1.0)
 
 
 def _contains(rectangle: tuple[float, float, float, float], x: float, y: float) -> bool:
