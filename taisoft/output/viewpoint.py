@@ -1,5 +1,6 @@
 """A perspective camera aimed at a target point: framing, orbiting, projection, and clipping of triangles and lines."""
 
+import itertools
 import math
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -7,14 +8,21 @@ from functools import cached_property
 import numpy as np
 
 from taisoft.mesh.placing import FROM_Y_UP
-from taisoft.scene.obstacles import HalfSpace
+from taisoft.scene.key_frames import ShapePath
+from taisoft.scene.obstacles import Capsule, HalfSpace, Sphere
 
 MAX_ELEVATION = 89.0  # [deg]; at 90 "up" is undefined
-FILL = 0.62  # fraction of the picture's width or height, whichever is reached first, that the bodies fill at the start
+FILL = 0.8  # fraction of the picture's width or height, whichever is reached first, that what is framed fills at the start
 BORDER = 0.06  # fraction of the picture, both sides together, kept free when the camera moves back from moving bodies
+AROUND = 1.0  # obstacles wholly within this of the bodies are framed, in diagonals of all bodies
+EDGE = 0.35  # of larger obstacles, such as a table, what lies within this of the bodies
+POSES = 5  # of an obstacle that key frames move, at which it is framed
 MAX_FALL = 3.0  # the part of a body's fall that is framed at the start, over the diagonal of all bodies
 MAX_WIDENING = 4.0  # largest distance over the first one; a body that flies away finally leaves the picture
 LEAST_SLOPE = 0.1  # cosine between a ground's normal and the vertical; a steeper half-space is a wall
+WHOLE = (0.0, 0.0, 1.0, 1.0)  # left, bottom, right and top of a picture, of which a part may be free
+DIRECTIONS = np.array([d for d in itertools.product((-1.0, 0.0, 1.0), repeat=3) if any(d)])  # (26,3); unit vectors from here on
+DIRECTIONS /= np.linalg.norm(DIRECTIONS, axis=1, keepdims=True)
 GUARD_BAND = 50.0  # half-size of the clipping region in half-sizes of the picture; triangles that cross it are cut
 NEAR, FAR = 0.02, 50.0  # clipping planes in units of the distance to the target
 
@@ -25,14 +33,34 @@ def start_positions(scene) -> np.ndarray:
 
 
 def framed_points(scene) -> np.ndarray:
-    """Return what a picture shows from the start on, (n,3) [m]: all nodes, and those of bodies that fall once they have landed.
+    """Return what a picture shows from the start on, (n,3) [m]: bodies, where those that fall land, and obstacles near them.
 
-    A body falls if it has no constraint and no connection; it lands on the first half-space at rest below it.
+    A body falls if it has no constraint and no connection; it lands on the first half-space at rest below it. Half-spaces are
+    not framed. Obstacles with key frames are framed at POSES of their way.
     """
     starts, connected = start_positions(scene), {name for one in scene.connections for name in one.owners}
-    longest = MAX_FALL * float(np.linalg.norm(np.ptp(starts, axis=0)))
+    diagonal = float(np.linalg.norm(np.ptp(starts, axis=0)))
     falling = [body for body in scene.bodies if not scene.constraints(body) and body.name not in connected]
-    return np.concatenate([starts, *(_landed(scene, body.rest_positions + body.position, longest) for body in falling)])
+    landed = (_landed(scene, body.rest_positions + body.position, MAX_FALL * diagonal) for body in falling)
+    bodies = np.concatenate([starts, *landed])
+    low, high, framed = bodies.min(axis=0), bodies.max(axis=0), [bodies]
+    for obstacle in (o for o in scene.obstacles if not isinstance(o.shape, HalfSpace)):
+        end = obstacle.path.frames.times[-1] if isinstance(obstacle.path, ShapePath) else 0.0
+        for t in np.linspace(0.0, end, POSES) if end > 0.0 else (0.0,):
+            x = obstacle.points_at(t, _outline(obstacle.shape))
+            is_near = np.maximum(low - x, x - high).max() <= AROUND * diagonal
+            margin = (AROUND if is_near else EDGE) * diagonal
+            if (x.max(axis=0) >= low - margin).all() and (x.min(axis=0) <= high + margin).all():
+                framed.append(np.clip(x, low - margin, high + margin))
+    return np.concatenate(framed)
+
+
+def _outline(shape) -> np.ndarray:
+    """Return points (n,3) [m] on a shape that span it: vertices, or those of round shapes along DIRECTIONS."""
+    if not isinstance(shape, (Sphere, Capsule)):
+        return shape.surface()[0]
+    ends = (shape.a, shape.b) if isinstance(shape, Capsule) else (shape.center,)
+    return np.concatenate([end + shape.radius * DIRECTIONS for end in ends])
 
 
 def _landed(scene, x: np.ndarray, longest: float) -> np.ndarray:
@@ -80,7 +108,8 @@ class Viewpoint:
     """A camera aimed at target (3,) [m] from a distance [m].
 
     azimuth [deg] about up: 0 looks along -z (with z up: +y), 90 along -x; elevation [deg] above the horizon; fov [deg]: vertical
-    field of view; up: axis that points up, "y" or "z".
+    field of view; up: axis that points up, "y" or "z"; shift: how far the target is right of and above the picture's
+    middle, over the depth.
     """
 
     target: np.ndarray = field(default_factory=lambda: np.zeros(3))
@@ -89,20 +118,28 @@ class Viewpoint:
     elevation: float = 20.0
     fov: float = 30.0
     up: str = "y"
+    shift: tuple[float, float] = (0.0, 0.0)
 
     @classmethod
-    def framing(cls, points: np.ndarray, size: tuple[int, int] = (16, 9), **angles) -> "Viewpoint":
-        """Return a camera aimed at the centre of the bounding box of points (n,3), which fill FILL of the picture.
+    def framing(cls, points: np.ndarray, size: tuple[int, int] = (16, 9), free: tuple = WHOLE, **angles) -> "Viewpoint":
+        """Return the nearest camera for which points (n,3) lie within FILL of the free part of the picture.
 
-        size: width and height of the picture, in any unit.
+        size: width and height of the picture, in any unit; free: left, bottom, right and top of the part, as fractions. The
+        target is in its middle, as deep as the middle of the points.
         """
-        camera = cls(target=(np.min(points, axis=0) + np.max(points, axis=0)) / 2, **angles)
-        return replace(camera, distance=max(camera._distance(points, size, FILL), 1e-9))  # of a single point: above 0
+        middle = (np.min(points, axis=0) + np.max(points, axis=0)) / 2
+        camera = cls(target=middle, **angles)
+        local, (aim, half) = (points - middle) @ camera.axes.T, camera._slopes(free, size, FILL)
+        x, depth = local[:, :2], local[:, 2:]
+        # points beside the target that the eye sees within aim +- half: |x - target - aim * depth| <= half * (depth + distance)
+        low, high = (x - (aim + half) * depth).max(axis=0), (x - (aim - half) * depth).min(axis=0)
+        distance = max(*((low - high) / (2.0 * half)), 1e-9)  # of a single point: above 0
+        return replace(camera, target=middle + (low + high) / 2 @ camera.axes[:2], distance=float(distance), shift=tuple(aim))
 
     @property
     def position(self) -> np.ndarray:
         """Position of the eye (3,) [m]."""
-        return self.target - self.distance * self.forward
+        return self.target - self.distance * (self.forward + np.array(self.shift) @ self.axes[:2])
 
     @cached_property
     def forward(self) -> np.ndarray:
@@ -128,19 +165,21 @@ class Viewpoint:
         """Distances of the near and the far clipping plane [m]."""
         return NEAR * self.distance, FAR * self.distance
 
-    def widened(self, points: np.ndarray, size: tuple[int, int], limit: float) -> "Viewpoint":
-        """Return the camera moved back, to limit [m] at most, until points (n,3) lie within the picture less BORDER.
+    def widened(self, points: np.ndarray, size: tuple[int, int], limit: float, free: tuple = WHOLE) -> "Viewpoint":
+        """Return the camera moved back, to limit [m] at most, until points (n,3) lie within the free part less BORDER.
 
-        size: width and height of the picture. Never moves nearer; points that are not finite are ignored.
+        size, free: as for `framing`; the target moves to the middle of the part. Never moves nearer; points that are not finite
+        are ignored.
         """
-        return replace(self, distance=max(self.distance, min(self._distance(points, size, 1.0 - BORDER), limit)))
+        local, (aim, half) = (points - self.target) @ self.axes.T, self._slopes(free, size, 1.0 - BORDER)
+        needed = np.abs(local[:, :2] - aim * local[:, 2:]) / half - local[:, 2:]
+        distance = float(np.max(needed, initial=0.0, where=np.isfinite(needed)))
+        return replace(self, distance=max(self.distance, min(distance, limit)), shift=tuple(aim))
 
-    def _distance(self, points: np.ndarray, size: tuple[int, int], fraction: float) -> float:
-        """Return the distance [m] from the target at which points (n,3) fill a fraction of the picture's width or height."""
-        right, up, forward = self.axes @ (np.asarray(points) - self.target).T
-        half = fraction * self.slope
-        needed = np.maximum(np.abs(right) / (half * size[0] / size[1]), np.abs(up) / half) - forward
-        return float(np.max(needed, initial=0.0, where=np.isfinite(needed)))
+    def _slopes(self, free: tuple, size: tuple[int, int], fraction: float) -> tuple[np.ndarray, np.ndarray]:
+        """Return the middle of a free part, as `shift`, and half of a fraction of its width and height, (2,) over the depth."""
+        low, high = 2.0 * self.slope * (np.reshape(free, (2, 2)) - 0.5) * (size[0] / size[1], 1.0)
+        return (low + high) / 2, fraction * (high - low) / 2
 
     def clipped(
         self, x: np.ndarray, triangles: np.ndarray, attributes: np.ndarray, size: tuple[int, int]

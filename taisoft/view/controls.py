@@ -1,7 +1,7 @@
 """What the live window changes in a simulation: dt, gravity, materials, friction, solver, and the drag with the mouse.
 
-All of them but the solver are run-time data, so nothing is recompiled. Young's modulus and density are multiplied by a power of
-ten that the sliders set, so that regions and tets keep their ratios.
+All of them but the solver are run-time data, so nothing is recompiled. Young's modulus and density are multiplied by a factor,
+so that regions and tets keep their ratios.
 """
 
 import itertools
@@ -19,7 +19,7 @@ from taisoft.stability import stable_dt
 SAFETY = 0.95  # upper end of dt of explicit integrators, as a fraction of the stable dt
 MAX_DT = 0.1  # upper end of dt of implicit integrators [s]
 MIN_DT = 0.01  # lower end of dt, in units of the initial dt
-DECADES = {"young": 2.0, "density": 1.0}  # range to either side of the initial value
+RATIOS = {"young": 100.0, "density": 10.0}  # between the initial value and either end of its range
 MAX_GRAVITY = 3.0  # in units of the initial gravity
 HALVINGS = 20  # of dt for a stiffer or lighter body, at most
 
@@ -39,9 +39,9 @@ class Controls:
         self._g_direction = g / self._g if self._g else 0.0 - UP[scene.up]
         elastic = [body for body in scene.bodies if not isinstance(body, RigidBody)]
         self._names = [body.name for body in scene.bodies]
-        self._initial = {what: {body.name: getattr(body, what) for body in elastic} for what in DECADES}
+        self._initial = {what: {body.name: getattr(body, what) for body in elastic} for what in RATIOS}
         self._stiffnesses = {body.name: body.composition.stiffnesses for body in elastic}
-        self._exponents = {what: dict.fromkeys(self._initial[what], 0.0) for what in DECADES}
+        self._factors = {what: dict.fromkeys(self._initial[what], 1.0) for what in RATIOS}
         self._pairs = touching_pairs(sim)
         self._frictions: list[float] | None = None  # of the pairs; None if unknown
         self._held: tuple | None = None  # body, nodes and weights of the present drag
@@ -57,7 +57,7 @@ class Controls:
             "dt_ends": self._dt_ends(),
             "gravity": self._g,
             "max_gravity": self._max_g,
-            **{what: [self._range(what, name) for name in self._names] for what in DECADES},
+            **{what: [self._range(what, name) for name in self._names] for what in RATIOS},
             "friction": self._frictions,
             "draggable": sim.draggable,
             "drag": None if drag is None else (float(np.linalg.norm(drag.force)), float(drag.max_force)),
@@ -65,13 +65,13 @@ class Controls:
             "contact_solver": settings.contact_solver,
         }
 
-    def _range(self, what: str, name: str) -> tuple[float, float, float] | None:
-        """Return the least and the largest value of a number of a body, and the exponent of its factor; None if it is rigid."""
+    def _range(self, what: str, name: str) -> tuple[float, float, float, float] | None:
+        """Return the least and the largest value of a number of a body, and the ends of the largest; None if it is rigid."""
         if name not in self._initial[what]:
             return None
-        exponent = self._exponents[what][name]
-        present = self._initial[what][name] * 10.0**exponent
-        return float(np.min(present)), float(np.max(present)), exponent
+        initial, factor, ratio = self._initial[what][name], self._factors[what][name], RATIOS[what]
+        least, largest = float(np.min(initial)), float(np.max(initial))
+        return factor * least, factor * largest, largest / ratio, largest * ratio
 
     def _dt_ends(self) -> tuple[float, float]:
         sim = self._sim
@@ -94,15 +94,16 @@ class Controls:
         self._sim.set_gravity(size * self._g_direction)
         self._g = size
 
-    def set_number(self, what: str, names: list[str], exponent: float) -> None:
-        """Multiply the initial young or density of elastic bodies by a power of ten; for young, all stiffnesses of a law.
+    def set_number(self, what: str, names: list[str], value: float) -> None:
+        """Set young or density of elastic bodies: the largest of the first one's to a value, the others by the same factor.
 
-        An explicit dt is lowered if it would not be stable; the requested one is restored as soon as it is.
+        It multiplies the initial values, for young all stiffnesses of a law. An explicit dt is lowered if it would not be stable;
+        the requested one is restored as soon as it is.
         """
-        sim = self._sim
+        sim, factor = self._sim, value / float(np.max(self._initial[what][names[0]]))
         for name in names:
             initial = {what: self._initial[what][name]} if what != "young" else self._stiffnesses[name]
-            numbers = {number: value * 10.0**exponent for number, value in initial.items()}
+            numbers = {number: value * factor for number, value in initial.items()}
             for k in range(HALVINGS):
                 try:
                     sim.set_material(name, **numbers)
@@ -111,7 +112,7 @@ class Controls:
                     if k == HALVINGS - 1:
                         raise
                     sim.dt = 0.5 * sim.dt
-            self._exponents[what][name] = exponent
+            self._factors[what][name] = factor
         self._restore_dt()
 
     def set_friction(self, k: int | None, friction: float) -> None:

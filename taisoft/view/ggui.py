@@ -156,7 +156,7 @@ class Canvas:
             self._decals[: len(decals[2])] = self._n + decals[2]
         eye = ti.ui.Camera()
         eye.position(*(camera.position - camera.target))
-        eye.lookat(0.0, 0.0, 0.0)
+        eye.lookat(*(camera.position - camera.target + camera.distance * camera.forward))
         eye.up(*UP[camera.up].tolist())
         eye.fov(camera.fov)
         eye.z_near(camera.clipping[0])

@@ -1,7 +1,7 @@
 """The panel of the live window: texts, buttons and sliders, which become commands for the simulation's process.
 
-GGUI identifies a slider by the part of its label after ###, so the part before shows the value in its unit. The number in that
-of dt, Young's modulus and density is the decimal logarithm of that value. The simulation answers a change with its next state;
+GGUI shows a slider's number with three decimals, so its unit is one in which that is neither large nor small. What may change by
+decades has a range around its value, which moves when the mouse is released. The simulation answers a change with its next state;
 until then a slider keeps the value that was set.
 """
 
@@ -12,16 +12,18 @@ from collections.abc import Callable
 from taisoft.dynamics.schemes import CHOICES
 from taisoft.settings import contact_solvers
 from taisoft.view.colouring import TITLES, Colouring, following
-from taisoft.view.controls import DECADES
 from taisoft.view.keys import KEYS
 from taisoft.view.scene_view import Layers
 
 MAX_FRICTION = 1.5
-STRENGTH_DECADES = (-0.5, 2.5)  # of the drag force over the body's weight, for a displacement as long as the body's diagonal
+STRENGTHS = (0.3, 300.0)  # of the drag force over the body's weight, for a displacement as long as the body's diagonal
 COLUMNS = 52  # characters that fit the panel's width
 MAX_PAIRS = 12  # with a slider of their own
 TITLE = {"young": "E", "density": "rho"}
 UNIT = {"young": "Pa", "density": "kg/m3"}
+PREFIXES = {1e9: "G", 1e6: "M", 1e3: "k", 1.0: "", 1e-3: "m", 1e-6: "u"}
+PREFIXED = ("Pa", "s")  # units
+LEAST = 0.01  # lower end of a range that moves, over its upper end
 
 
 class Requests:
@@ -66,18 +68,21 @@ class Panel:
         self.chosen, self._all_bodies = bodies[0], len(bodies) > 1
         self._open_section = "keys and mouse"
         self._solver: tuple[str, str] | None = None  # chosen integrator and contact solver; None: those in use
-        self._strength = 1.0  # decades
+        self._strength = 10.0
         self._set: dict[str, tuple[float, int]] = {}  # by slider, a value set and the number of its request
+        self._ranges: dict[str, tuple[float, float, str, float]] = {}  # by slider, as from `range_about`
+        self._held = False
         self._state: dict = {}
 
     @property
     def strength(self) -> float:
         """Drag force over the body's weight, for a displacement as long as the body's diagonal; 0 if nothing can be dragged."""
-        return 10.0**self._strength if self._state.get("controls", {}).get("draggable") else 0.0
+        return self._strength if self._state.get("controls", {}).get("draggable") else 0.0
 
-    def draw(self, gui, state: dict) -> None:
-        """Declare buttons and sliders in a GGUI sub-window, and request their changes."""
+    def draw(self, gui, state: dict, held: bool = False) -> None:
+        """Declare buttons and sliders in a GGUI sub-window, and request their changes. held: whether the mouse holds one."""
         self.pressed.clear()
+        self._held = held
         self._state, values = state, state["controls"]
         names = {"pause": "run" if state["paused"] else "pause", "step": "step", "reset": "restart", "unbound": "real time"}
         if state["asked_speed"] is not None:
@@ -85,15 +90,14 @@ class Panel:
         for action, text in names.items():
             if gui.button(f"{text}###{action}"):
                 self.pressed.add(action)
-        dt, ends = self._present("dt", math.log10(values["dt"])), map(math.log10, values["dt_ends"])
-        self._slider(gui, "dt", f"dt {values['dt']:.3g} s", dt, ends, "set_dt", convert=lambda new: 10.0**new)
-        g = self._present("gravity", values["gravity"])
-        self._slider(gui, "gravity", f"g {g:.3g} m/s2", g, (0.0, values["max_gravity"]), "set_gravity")
+        self._slider(gui, "dt", "dt", values["dt"], values["dt_ends"], "set_dt", unit="s")
+        self._slider(gui, "gravity", "g", values["gravity"], (0.0, values["max_gravity"]), "set_gravity", unit="m/s2")
         self._materials(gui, values)
         if self._pairs:
-            self._all_frictions(gui, values["friction"])
+            least, largest = min(values["friction"]), max(values["friction"])
+            self._slider(gui, "friction", "mu", largest, (0.0, MAX_FRICTION), "set_friction", None, least=least)
         if values["draggable"]:
-            self._strength = gui.slider_float(f"drag {self.strength:.3g} weights###pull", self._strength, *STRENGTH_DECADES)
+            self._strength = self._slider(gui, "pull", "drag", self._strength, STRENGTHS, unit="weights")
             force = values["drag"]
             text = "no body is dragged" if force is None else f"drag force {force[0]:.3g} N of at most {force[1]:.3g}"
             gui.text(text)
@@ -105,47 +109,41 @@ class Panel:
 
     # --- sliders ------------------------------------------------------------------------------------------------------
 
-    def _present(self, key: str, value: float) -> float:
-        """Return a slider's value: the one set until the simulation has answered."""
-        if key in self._set and self._set[key][1] <= self._state["answered"]:
-            del self._set[key]
-        return self._set[key][0] if key in self._set else value
+    def _slider(self, gui, name: str, text: str, value: float, limits, *command, unit="", least: float | None = None) -> float:
+        """Declare a slider, and request its change: a command and its arguments, of which the last is the new value.
 
-    def _slider(self, gui, name: str, label: str, present: float, ends, *command, of: str = "", convert=float) -> None:
-        """Declare a slider, and request its change: a command and its arguments, of which the converted new value is the last.
-
-        of: what the value belongs to, if that changes; its key is name + of.
+        least: of several values, of which this is the largest. Returns the value shown: the one set until the simulation answers.
         """
-        low, high = ends
-        new = gui.slider_float(f"{label}###{name}", present, low, max(high, present))
-        if changed(new, present):
-            self._set[name + of] = (new, self._requests.next_number)
-            self._requests.add(*command, convert(new), key=name + of)
+        if name in self._set and self._set[name][1] <= self._state["answered"]:
+            del self._set[name]
+        present = self._set[name][0] if name in self._set else value
+        if not self._held or name not in self._ranges:
+            self._ranges[name] = range_about(present, limits, unit)
+        low, high, shown_unit, scale = self._ranges[name]
+        label = text + (f" [{shown_unit}]" if unit else "")
+        if least is not None and f"{least:.4g}" != f"{value:.4g}":
+            label += f" {least / scale:.3g} to {value / scale:.3g}"
+        shown, ends = present / scale, (min(low, present) / scale, max(high, present) / scale)
+        new = gui.slider_float(f"{label}###{name}", shown, *ends)
+        if not changed(new, shown):
+            return present
+        new = min(max(scale * new, limits[0]), max(limits[1], present))  # GGUI lets one type a number
+        if command:
+            self._set[name] = (new, self._requests.next_number)
+            self._requests.add(*command, new, key=name)
+        return new
 
     def _materials(self, gui, values: dict) -> None:
-        """Declare sliders of Young's modulus and density, of the chosen body or of all."""
+        """Declare sliders of Young's modulus and density, of the chosen body or of all; they show those of the first one."""
         if len(self._bodies) > 1 and gui.button(("all bodies" if self._all_bodies else self.chosen) + "###which"):
             self._all_bodies = not self._all_bodies
-        shown = [self.chosen, *(self._bodies if self._all_bodies else ())]
-        for what in DECADES:
+        shown = dict.fromkeys([self.chosen, *(self._bodies if self._all_bodies else ())])
+        for what, title in TITLE.items():
             ranges = dict(zip(self._bodies, values[what]))
-            if known := [name for name in shown if ranges[name] is not None]:  # rigid bodies have none
-                self._material(gui, what, known, *ranges[known[0]])
-
-    def _material(self, gui, what: str, names: list[str], low: float, high: float, exponent: float) -> None:
-        """Declare a slider of a number of bodies, which shows that of the first."""
-        text = f"{low:.4g}" if f"{low:.4g}" == f"{high:.4g}" else f"{low:.3g} to {high:.3g}"
-        initial, of = math.log10(high) - exponent, f" of {names[0]}"
-        present, ends = self._present(what + of, math.log10(high)), (initial - DECADES[what], initial + DECADES[what])
-        command = "set_number", what, [one for one in self._bodies if one in names]
-        label = f"{TITLE[what]} {text} {UNIT[what]}"
-        self._slider(gui, what, label, present, ends, *command, of=of, convert=lambda new: new - initial)
-
-    def _all_frictions(self, gui, frictions: list[float]) -> None:
-        """Declare a slider that sets the friction of all pairs; it shows the largest one."""
-        low, high = f"{min(frictions):.2f}", f"{max(frictions):.2f}"
-        present, label = self._present("friction", max(frictions)), f"mu {low if low == high else f'{low}-{high}'}"
-        self._slider(gui, "friction", label, present, (0.0, MAX_FRICTION), "set_friction", None)
+            if names := [name for name in shown if ranges[name] is not None]:  # rigid bodies have none
+                least, largest, *limits = ranges[names[0]]
+                command, more = ("set_number", what, names), {"unit": UNIT[what], "least": least}
+                self._slider(gui, f"{what} of {names[0]}", title, largest, limits, *command, **more)
 
     # --- sections -----------------------------------------------------------------------------------------------------
 
@@ -164,9 +162,7 @@ class Panel:
         """Declare a slider for each pair, of the friction in use."""
         frictions = self._state["controls"]["friction"]
         for k, (pair, friction) in enumerate(zip(self._pairs[:MAX_PAIRS], frictions)):
-            name = f"friction {k}"
-            present = self._present(name, friction)
-            self._slider(gui, name, f"{present:.2f} {pair[0]}, {pair[1]}", present, (0.0, MAX_FRICTION), "set_friction", k)
+            self._slider(gui, f"friction {k}", f"{pair[0]}, {pair[1]}", friction, (0.0, MAX_FRICTION), "set_friction", k)
         if len(self._pairs) > MAX_PAIRS:
             gui.text(f"and {len(self._pairs) - MAX_PAIRS} more pairs")
 
@@ -193,6 +189,19 @@ class Panel:
             gui.text("in use")
         elif gui.button("use this: compiles for some seconds###use"):
             self._requests.add("rebuild", integrator, solver, key="rebuild")
+
+
+def range_about(value: float, limits: tuple[float, float], unit: str) -> tuple[float, float, str, float]:
+    """Return the ends of a slider, its unit with a prefix, and how many of the given units that is.
+
+    Limits from 0 on are the ends. Else the upper end is the next of 1, 2 or 5 times a power of ten above twice the value.
+    """
+    if limits[0] <= 0.0:
+        return *limits, unit, 1.0
+    power = 10.0 ** math.floor(math.log10(2.0 * value))
+    high = min(next(k * power for k in (1, 2, 5, 10) if k * power > (2.0 - 1e-9) * value), limits[1])
+    scale = next((one for one in PREFIXES if one <= (1.0 + 1e-9) * value), min(PREFIXES)) if unit in PREFIXED else 1.0
+    return max(LEAST * high, limits[0]), high, PREFIXES[scale] + unit, scale
 
 
 def changed(new: float, old: float) -> bool:

@@ -17,7 +17,7 @@ import numpy as np
 from taisoft.errors import OutputError
 from taisoft.mesh.topology import linked_groups, triangle_edges
 from taisoft.output.appearance import ObstacleSurface, ShownBodies, body_colours, obstacle_colour, obstacle_surfaces, subdivide
-from taisoft.output.viewpoint import MAX_WIDENING, Viewpoint, camera_viewpoint
+from taisoft.output.viewpoint import MAX_WIDENING, WHOLE, Viewpoint, camera_viewpoint
 from taisoft.scene.look import Camera
 from taisoft.scene.obstacles import HalfSpace
 from taisoft.view.colouring import Colouring, lit_colours
@@ -67,8 +67,13 @@ class SceneView:
 
     def look_from(self, size: tuple[int, int], **angles: float) -> None:
         """Frame what the scene shows from the start on, from angles [deg] as of `Viewpoint`; the camera moves back as before."""
-        self.camera, self._has_own = Viewpoint.framing(self.scene.framed, size, up=self.scene.up, **angles), False
+        self._has_own = False
+        self.camera = Viewpoint.framing(self.scene.framed, size, self._free(size), up=self.scene.up, **angles)
         self._widest = MAX_WIDENING * self.camera.distance
+
+    def _free(self, size: tuple[int, int]) -> tuple[float, float, float, float]:
+        """Return the part of a picture of this size in which the bodies are framed, as for `Viewpoint.framing`."""
+        return WHOLE
 
     def sampled(self, sim) -> DrawnState:
         """Return the present state of a simulation of the scene, with what is visible; a `DrawnState` as it is."""
@@ -83,7 +88,7 @@ class SceneView:
         bodies = self.surfaces.of_bodies(state)
         if self._has_own:
             self.camera = camera_viewpoint(self.scene, state.time, state.x)
-        self.camera = self.camera.widened(bodies[0], size, self._widest)
+        self.camera = self.camera.widened(bodies[0], size, self._widest, self._free(size))
         x, normals = self.surfaces.with_obstacles(bodies, state, self.camera.position)
         colours = lit_colours(x, normals, self.colouring.base(state), self.camera)
         return x, colours, self.layers.lines(state, self.camera)

@@ -26,6 +26,7 @@ SIZE = (1280, 720)
 PANEL = (0.012, 0.02, 0.31, 0.96)  # left, top, width, height as fractions of the window's initial size
 SHORT_PANEL = (0.012, 0.02, 0.31, 0.22)  # of a window without controls
 MESSAGES = (0.334, 0.87, 0.4, 0.11)
+ABOVE_MESSAGES = 0.04  # fraction of the window kept free below what is framed, beside its border
 ORBIT = 240.0  # angle for a drag over the whole window [deg]
 ZOOM = 16.0  # factor on the distance for a drag over the whole window
 DRAG_COLOUR = np.array([0.85, 0.10, 0.35])  # sRGB
@@ -43,6 +44,7 @@ class Screen(SceneView):
     """
 
     def __init__(self, scene: DrawnScene, description: dict, requests: Requests):
+        self._panel_rectangle = PANEL if description["controls"] else SHORT_PANEL
         super().__init__(scene, SIZE, None, description["colour"], tuple(description["layers"]))
         self.timing = Timing()
         self.layers.shown["shadows"] = True
@@ -51,7 +53,6 @@ class Screen(SceneView):
         if description["controls"]:
             names = [body.name for body in scene.bodies]
             self._panel = Panel(names, description["pairs"], self.colouring, self.layers, requests)
-        self._panel_rectangle = PANEL if self._panel is not None else SHORT_PANEL
         self._cursor: tuple[float, float] | None = None  # at the last picture
         self._mode = ""  # of the present mouse drag: "turn", "zoom", "shift", "drag", or "panel", which GGUI handles
         self._follows, self._centre = False, None  # whether the camera follows the bodies; their last centre
@@ -97,7 +98,7 @@ class Screen(SceneView):
             for line in [state["status"], *state_lines(drawn), *self.timing.lines(state)]:
                 gui.text(line)
             if self._panel is not None:
-                self._panel.draw(gui, state)
+                self._panel.draw(gui, state, held=self._mode == "panel")
         self._show_messages(window.get_gui(), state, age)
         window.show()
         self.timing.shown(state)
@@ -117,6 +118,9 @@ class Screen(SceneView):
 
     # --- camera -------------------------------------------------------------------------------------------------------
 
+    def _free(self, size: tuple[int, int]) -> tuple[float, float, float, float]:
+        return free_part(self._panel_rectangle, size)
+
     def _follow(self, drawn: DrawnState) -> None:
         """Move the camera's target with the mean position of the nodes, but not while a body is dragged."""
         x = drawn.x
@@ -134,8 +138,8 @@ class Screen(SceneView):
         x = drawn.x
         x = x[np.isfinite(x).all(axis=1)]
         if len(x):
-            kept = {name: getattr(self.camera, name) for name in ("up", "azimuth", "elevation")}
-            self.camera, self._has_own = Viewpoint.framing(x, size, **kept), False
+            kept = {name: getattr(self.camera, name) for name in ("up", "azimuth", "elevation", "fov")}
+            self.camera, self._has_own = Viewpoint.framing(x, size, self._free(size), **kept), False
             self._widest = MAX_WIDENING * self.camera.distance
 
     def _move_camera(self, right: float, up: float, size) -> None:
@@ -227,6 +231,12 @@ class Screen(SceneView):
             self._note.set(f"written: {path}")
         except OutputError as error:
             self._note.set(str(error))
+
+
+def free_part(panel: tuple[float, float, float, float], size: tuple[int, int]) -> tuple[float, float, float, float]:
+    """Return the part of a window right of its panel, but at least a quarter, as for `Viewpoint.framing`."""
+    left, _, width, _ = panel
+    return (min((left + width) * SIZE[0] / max(size[0], 1), 0.75), ABOVE_MESSAGES, 1.0, 1.0)
 
 
 def _contains(rectangle: tuple[float, float, float, float], x: float, y: float) -> bool:

@@ -135,7 +135,7 @@ def test_a_run_continues_in_another_folder_with_another_dt(begun, tmp_path):
 
 def test_settings_that_cannot_change_are_refused(begun, capsys):
     path, out = begun
-    before = {file.name: file.read_bytes() for file in out.iterdir()}
+    before = {file.name: file.read_bytes() for file in out.rglob("*.*")}
     capsys.readouterr()
     for arguments, message in (
         (["--precision", "f64"], "precision is f32 there and cannot become f64 in a run"),
@@ -147,7 +147,7 @@ def test_settings_that_cannot_change_are_refused(begun, capsys):
         assert run(path, "--out", out, "--resume", out / "checkpoint.npz", "--seconds", "0.2", *arguments) == 2
         error = capsys.readouterr().err
         assert message in error and error.startswith("taisoft: ") and error.count("\n") == 1
-        assert {file.name: file.read_bytes() for file in out.iterdir()} == before
+        assert {file.name: file.read_bytes() for file in out.rglob("*.*")} == before
 
 
 def test_other_scenes_and_numbers_are_refused(begun, tmp_path, capsys):

@@ -5,8 +5,9 @@ import pytest
 
 import taisoft as ts
 from benchmarks.numpy_raster import rasterise
+from taisoft.cli.scene_file import load_scene
 from taisoft.mesh.placing import FROM_Y_UP
-from taisoft.output.viewpoint import Viewpoint, framed_points, start_positions
+from taisoft.output.viewpoint import BORDER, EDGE, FILL, WHOLE, Viewpoint, framed_points, start_positions
 
 SIZE = (320, 180)
 
@@ -18,8 +19,45 @@ def test_framing_shows_all_points(azimuth, elevation):
     projected = camera.project(points, SIZE)
     assert (projected[:, 2] > 0).all()
     fill = np.abs(2 * projected[:, :2] / SIZE - 1).max(axis=0)  # of the picture's width and height
-    assert 0.5 < fill.max() < 0.8
+    assert fill.max() == pytest.approx(FILL)
     assert np.allclose(camera.project(camera.target[None], SIZE), [[160, 90, camera.distance]])
+
+
+@pytest.mark.parametrize("azimuth, elevation", [(0, 0), (32, 20), (140, -60), (270, 89)])
+@pytest.mark.parametrize("free", [WHOLE, (0.4, 0.0, 1.0, 1.0), (0.1, 0.0, 0.3, 0.7)])
+def test_framing_is_as_close_as_the_free_part_of_the_picture_allows(azimuth, elevation, free):
+    """Two opposite sides of the part, less its border, are touched, and a camera that has moved back is so, too."""
+    points = np.random.default_rng(0).uniform(-1, 1, (200, 3)) * (3, 1, 2) + (10, 20, 30)
+    left, bottom, right, top = free
+
+    def gaps(camera, points):
+        """Distances from the left, right, bottom and top end of the part, (2,2), as fractions of its width and height."""
+        projected = camera.project(points, SIZE)
+        assert (projected[:, 2] > 0).all()
+        within = np.array([projected[:, 0] / SIZE[0] - left, 1 - projected[:, 1] / SIZE[1] - bottom]).T / (
+            right - left,
+            top - bottom,
+        )
+        return np.array([within.min(axis=0), 1.0 - within.max(axis=0)]).T
+
+    camera = Viewpoint.framing(points, SIZE, free, azimuth=azimuth, elevation=elevation)
+    border = (1.0 - FILL) / 2
+    assert gaps(camera, points).min() == pytest.approx(border)
+    assert np.abs(gaps(camera, points) - border).max(axis=1).min() < 1e-9, "two opposite sides"
+    middle = ((left + right) / 2 * SIZE[0], (1 - (bottom + top) / 2) * SIZE[1])
+    for one in (camera, camera.orbit(20.0, -5.0), camera.zoom(3.0)):
+        assert np.allclose(one.project(one.target[None], SIZE)[0, :2], middle), "the target stays there"
+    assert camera.widened(points, SIZE, 1e3, free) == camera
+    grown = 2 * points - points.mean(axis=0)
+    assert gaps(camera.widened(grown, SIZE, 1e3, free), grown).min() == pytest.approx(BORDER / 2)
+
+
+@pytest.mark.parametrize("name", ["hanging_cloth", "thin_cloth", "sheet_on_box", "sheet_and_cube"])
+@pytest.mark.filterwarnings("ignore:.*linear tet")
+def test_cloth_fills_the_picture(name):
+    scene = load_scene(name)[0]
+    across = Viewpoint.framing(framed_points(scene)).project(start_positions(scene), (16, 9))[:, 0] / 16
+    assert np.ptp(across) > 0.75 and across.min() > 0.05 and across.max() < 0.95
 
 
 def falling_cube(height: float, gravity=(0, -9.81, 0), normal=(0, 1, 0)) -> ts.Scene:
@@ -35,7 +73,7 @@ def test_the_first_picture_shows_the_ground_below_a_falling_body():
     assert points[:, 1].min() == pytest.approx(0.0) and points[:, 1].max() == pytest.approx(3.0) and len(points) == 16
     camera = Viewpoint.framing(points, SIZE)
     down = camera.project(points, SIZE)[:, 1]
-    assert down.min() > 0.15 * SIZE[1] and down.max() < 0.85 * SIZE[1] and camera.target[1] == pytest.approx(1.5)
+    assert down.min() == pytest.approx(0.1 * SIZE[1]) and down.max() == pytest.approx(0.9 * SIZE[1])
     tilted = falling_cube(2.0, normal=(1, 1, 0))
     landed = framed_points(tilted)[8:]
     assert (landed @ [1, 1, 0]).min() == pytest.approx(0.0) and np.allclose(landed[:, 0], framed_points(tilted)[:8, 0])
@@ -49,6 +87,25 @@ def test_a_fall_is_framed_only_where_it_is_known():
     for scene in (fixed, attached, wall, falling_cube(2.0, (0, 0, 0)), falling_cube(0.0), falling_cube(2.0, (0, 9.81, 0))):
         assert np.array_equal(framed_points(scene), start_positions(scene))
     assert 2 < np.ptp(framed_points(falling_cube(1000.0))[:, 1]) < 20
+
+
+def test_obstacles_near_the_bodies_are_framed():
+    """Whole, and where key frames move them; of a table a part; nothing of what is far, or of half-spaces."""
+    scene = falling_cube(0.0)
+    n = len(scene.bodies[0].rest_positions)
+    scene.add_obstacle(ts.Capsule((1.0, 0.5, 0), (1.5, 0.5, 0), 0.25), name="rod")
+    scene.add_obstacle(ts.Box((0, -0.2, 0), (50, 0.1, 50)), name="table")
+    scene.add_obstacle(ts.Sphere((9, 0, 0), 1.0), name="far")
+    x = framed_points(scene)
+    assert np.array_equal(x[:n], start_positions(scene)) and x[n:-8, 0].max() == pytest.approx(1.75)
+    assert x[n:-8, 1].max() == pytest.approx(0.75) and x[n:-8, 1].min() == pytest.approx(0.25), "the rod"
+    beside = 0.5 + EDGE * np.sqrt(3)
+    assert x[-8:].min(axis=0) == pytest.approx((-beside, -0.3, -beside)) and x[-8:].max(axis=0) == pytest.approx(
+        (beside, -0.1, beside)
+    )
+    moved = falling_cube(0.0)
+    moved.add_obstacle(ts.Sphere((9, 0, 0), 0.5), name="one", path=ts.KeyFrames((0.0, 2.0), ((0, 0, 0), (-7.5, 0, 0))))
+    assert framed_points(moved)[:, 0].max() == pytest.approx(2.0)
 
 
 def test_projection_is_that_of_a_pinhole_camera():

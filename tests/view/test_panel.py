@@ -9,10 +9,10 @@ import pytest
 import taichi as ti
 
 import taisoft as ts
-from taisoft.output.viewpoint import Viewpoint
+from taisoft.output.viewpoint import FILL, Viewpoint, framed_points
 from taisoft.view.controls import Controls, touching_pairs
-from taisoft.view.panel import Panel, Requests
-from taisoft.view.screen import SIZE, Screen
+from taisoft.view.panel import Panel, Requests, range_about
+from taisoft.view.screen import MESSAGES, PANEL, SIZE, Screen, free_part
 from taisoft.view.timing import Timing
 from tests.output.png import decode
 from tests.view.drawing import connected_scene, cubes_scene, sampled
@@ -20,15 +20,18 @@ from tests.view.fake_simulator import FakeSimulator
 
 
 class Gui:
-    """A panel in which sliders move to the values in `moves` and buttons in `presses` are pressed, by the part after ###."""
+    """A panel in which sliders move to the values in `moves` and buttons in `presses` are pressed, by the part after ###.
+
+    shown: by slider, its label and its number as GGUI prints it; ends: of the sliders.
+    """
 
     def __init__(self, moves=None, presses=(), checks=()):
-        self.moves, self.presses, self.checks, self.labels = moves or {}, presses, checks, {}
+        self.moves, self.presses, self.checks, self.shown, self.ends = moves or {}, presses, checks, {}, {}
 
     def slider_float(self, label, value, low, high):
-        shown, _, name = label.partition("###")
+        text, _, name = label.partition("###")
         assert low <= value <= high, label
-        self.labels[name] = shown
+        self.shown[name], self.ends[name] = f"{text}: {value:.3f}", (low, high)
         return self.moves.get(name, value)
 
     def button(self, label):
@@ -53,53 +56,86 @@ def state_of(controls, answered=0):
 
 @pytest.fixture
 def draw(cubes):
-    """A function that draws the panel with moves and presses, and returns the labels of sliders and the commands."""
+    """A function that draws the panel with moves and presses, and returns what the sliders show and the commands."""
     colouring = SimpleNamespace(kind="body", legend=list, choose_next=lambda: None)
     requests = Requests()
     panel = Panel(["a", "b", "c"], touching_pairs(cubes), colouring, SimpleNamespace(shown={}), requests)
     controls = Controls(cubes)
 
-    def draw(moves=None, state=None, **more):
-        panel.draw(gui := Gui(moves, **more), state or state_of(controls))
-        return gui.labels, requests.take()
+    def draw(moves=None, state=None, held=False, **more):
+        panel.draw(gui := Gui(moves, **more), state or state_of(controls), held)
+        draw.ends = gui.ends
+        return gui.shown, requests.take()
 
     draw.panel, draw.controls = panel, controls
     return draw
 
 
 def test_sliders_become_commands_and_keep_their_values(draw, cubes):
-    labels, commands = draw({"gravity": 3.0, "young": 6.0, "dt": -3.0, "friction": 0.9})
-    shown = {"young": "E 1e+05 Pa", "density": "rho 1000 kg/m3", "gravity": "g 9.81 m/s2", "friction": "mu 0.20-0.50"}
-    assert shown.items() <= labels.items()
+    shown, commands = draw({"gravity": 3.0, "young of a": 150.0, "dt": 1.0, "friction": 0.9})
+    expected = {
+        "young of a": "E [kPa]: 100.000",
+        "density of a": "rho [kg/m3]: 1000.000",
+        "gravity": "g [m/s2]: 9.810",
+        "dt": "dt [ms]: 2.000",
+    }
+    assert (expected | {"friction": "mu 0.2 to 0.5: 0.500", "pull": "drag [weights]: 10.000"}).items() <= shown.items()
     assert commands[:2] == [["set_dt", pytest.approx(1e-3)], ["set_gravity", 3.0]]
-    assert commands[2:] == [["set_number", "young", ["a", "b", "c"], pytest.approx(1.0)], ["set_friction", None, 0.9]]
-    labels, none = draw()
-    assert labels["gravity"] == "g 3 m/s2" and none == [], "not yet answered"
+    assert commands[2:] == [["set_number", "young", ["a", "b", "c"], pytest.approx(1.5e5)], ["set_friction", None, 0.9]]
+    shown, none = draw()
+    assert shown["gravity"] == "g [m/s2]: 3.000" and none == [], "not yet answered"
     for name, *arguments in commands:
         getattr(draw.controls, name)(*arguments)
     draw.controls.set_gravity(2.0)
-    labels, none = draw(state=state_of(draw.controls, answered=1))
-    shown = {"gravity": "g 2 m/s2", "young": "E 1e+06 Pa", "friction": "mu 0.90", "dt": "dt 0.001 s"}
-    assert shown.items() <= labels.items() and none == []
+    shown, none = draw(state=state_of(draw.controls, answered=1))
+    expected = {"gravity": "g [m/s2]: 2.000", "young of a": "E [kPa]: 150.000", "friction": "mu: 0.900", "dt": "dt [ms]: 1.000"}
+    assert expected.items() <= shown.items() and none == []
     assert cubes.dt == pytest.approx(1e-3) and cubes.scene.gravity.tolist() == [0.0, -2.0, 0.0]
-    assert all(np.allclose(body.young, 1e6) for body in cubes.scene.bodies)
+    assert all(np.allclose(body.young, 1.5e5) for body in cubes.scene.bodies)
+
+
+def test_several_drags_of_a_slider_reach_values_that_are_decades_away(draw):
+    """Its range moves between them, within the limits; a number that is typed is limited too."""
+    for low, high, moved in ((2.0, 200.0, 200.0), (5.0, 500.0, 500.0), (10.0, 1000.0, 10.0), (1.0, 20.0, 1.0)):
+        draw()
+        for value in (0.5 * (low + high), moved):
+            _, ((_, _, _, young),) = draw({"young of a": value}, held=True)
+            assert draw.ends["young of a"] == pytest.approx((low, high)), "it stays while the mouse is down"
+            assert young == pytest.approx(1e3 * value)
+    shown, ((*_, young),) = draw({"young of a": -5.0})
+    assert shown["young of a"] == "E [kPa]: 1.000" and young == pytest.approx(1e3)
+
+
+@pytest.mark.parametrize(
+    "value, limits, unit, expected",
+    [
+        (1 / 60, (1e-4, 0.1), "s", (5e-4, 0.05, "ms", 1e-3)),
+        (1e-3, (1e-5, 1.5e-3), "s", (1.5e-5, 1.5e-3, "ms", 1e-3)),
+        (2e-8, (1e-10, 0.1), "s", (5e-10, 5e-8, "us", 1e-6)),
+        (2.1e11, (2e9, 2e13), "Pa", (5e9, 5e11, "GPa", 1e9)),
+        (7800.0, (780.0, 78000.0), "kg/m3", (780.0, 2e4, "kg/m3", 1.0)),
+        (9.81, (0.0, 29.43), "m/s2", (0.0, 29.43, "m/s2", 1.0)),
+    ],
+)
+def test_a_slider_has_a_round_range_about_its_value_and_a_fitting_unit(value, limits, unit, expected):
+    assert range_about(value, limits, unit) == pytest.approx(expected)
 
 
 def test_rigid_bodies_have_no_sliders_of_material(draw):
-    soft = (pytest.approx(1e5), pytest.approx(1e5), 0.0)
+    soft = pytest.approx((1e5, 1e5, 1e3, 1e7))
     assert Controls(FakeSimulator(connected_scene())).values()["young"] == [soft, soft, None]
     state = state_of(draw.controls)
     state["controls"] |= {what: [None, *state["controls"][what][1:]] for what in ("young", "density")}  # as if a were one
-    assert draw({"young": 6.0}, state)[1] == [["set_number", "young", ["b", "c"], pytest.approx(1.0)]]
-    labels, _ = draw(state=state, presses=("which",))  # from all bodies to the first one
-    assert {"young", "density"}.isdisjoint(labels)
+    assert draw({"young of b": 150.0}, state)[1] == [["set_number", "young", ["b", "c"], pytest.approx(1.5e5)]]
+    shown, _ = draw(state=state, presses=("which",))  # from all bodies to the first one
+    assert not any(name.startswith(("young", "density")) for name in shown)
 
 
 def test_every_pair_shows_its_friction_and_buttons_choose_a_solver(draw, cubes):
     draw(checks=["friction of pairs"])
-    labels, ((name, *arguments),) = draw({"friction 2": 0.8})
-    shown = [labels[f"friction {k}"] for k in range(6)]
-    assert shown == ["0.50 a, b", "0.50 a, c", "0.20 a, ground", "0.50 b, c", "0.50 b, ground", "0.50 c, ground"]
+    shown, ((name, *arguments),) = draw({"friction 2": 0.8})
+    pairs = zip(("a, b", "a, c", "a, ground", "b, c", "b, ground", "c, ground"), (0.5, 0.5, 0.2, 0.5, 0.5, 0.5))
+    assert [shown[f"friction {k}"] for k in range(6)] == [f"{names}: {friction:.3f}" for names, friction in pairs]
     getattr(draw.controls, name)(*arguments)
     assert draw.controls.values()["friction"] == [0.5, 0.5, 0.8, 0.5, 0.5, 0.5]
     assert cubes.scene.contact_numbers("a", "ground")[0] == 0.8
@@ -114,9 +150,9 @@ def test_an_explicit_dt_follows_density(cubes):
     controls.set_dt(1.0)
     largest = cubes.dt
     assert 0.8 * limit < largest < limit
-    controls.set_number("density", ["b"], -1.0)
+    controls.set_number("density", ["b"], 100.0)
     assert cubes.scene.body("b").mass == pytest.approx(100.0) and cubes.dt == pytest.approx(largest / np.sqrt(10), rel=1e-3)
-    controls.set_number("density", ["b"], 0.0)
+    controls.set_number("density", ["b"], 1000.0)
     assert cubes.dt == pytest.approx(largest)
     with pytest.raises(ts.SimulationError):
         controls.set_dt(-1.0)
@@ -223,11 +259,34 @@ def test_keys(screen, tmp_path, cubes):
     assert [path.name for path in sorted((tmp_path / "out").iterdir())] == ["window-1.png", "window-2.png"]
     screen.camera = replace(screen.camera, target=np.ones(3), azimuth=70.0)
     act("h")
-    expected = Viewpoint.framing(cubes.positions(), SIZE, azimuth=70.0, elevation=screen.camera.elevation)
+    expected = Viewpoint.framing(cubes.positions(), SIZE, free_part(PANEL, SIZE), azimuth=70.0, elevation=screen.camera.elevation)
     assert np.allclose(screen.camera.position, expected.position) and np.allclose(screen.camera.target, expected.target)
     assert not screen.closed
     act([ti.ui.ESCAPE])
     assert screen.closed
+
+
+def test_the_panel_hides_nothing_that_is_framed(screen, cubes):
+    """At the start, when the camera has moved back, and framed again in a window of another size."""
+    screen, canvas, act = screen
+    right_end, x, start = (PANEL[0] + PANEL[2]) * SIZE[0], cubes.positions(), screen.camera
+
+    def across(points, size=SIZE):
+        projected = screen.camera.project(points, size)
+        assert projected[:, 0].min() > right_end and projected[:, 0].max() < size[0]
+        assert projected[:, 1].min() > 0.0 and projected[:, 1].max() < size[1]
+        return np.ptp(projected[:, :2], axis=0)
+
+    assert across(framed_points(cubes.scene))[1] == pytest.approx(FILL * 0.96 * SIZE[1])
+    assert start.project(x, SIZE)[:, 1].max() < MESSAGES[1] * SIZE[1]
+    act()
+    assert screen.camera == start, "the camera stays while all is in view"
+    screen.camera = start.zoom(0.3)
+    act()
+    assert across(x)[1] > 0.85 * SIZE[1], "it has moved back"
+    canvas.get_window_shape = lambda: (700, 600)
+    act("h")
+    assert across(x, (700, 600))[0] > 0.5 * (700 - right_end)
 
 
 def test_the_mouse_moves_the_view(screen):
