@@ -29,6 +29,8 @@ def describe_scene(scene, marks: ConnectionMarks) -> dict:
     return {
         "gravity": np.asarray(scene.gravity),
         "up": scene.up,
+        "background": scene.background,
+        "lights": None if scene.lights is None else [vars(one) for one in scene.lights],
         "connections": [{"owners": list(one.owners)} for one in scene.connections],
         "marks": [marks.attached, marks.pressed, marks.strokes],
         "bodies": [
@@ -83,7 +85,8 @@ class MirrorScene:
         for skin in (body.riding_skin for body in self.bodies if body.riding_skin):
             parts = skin.weights
             skin.weights = sp.csr_matrix((parts.data, parts.indices, parts.indptr), shape=parts.shape)
-        self.gravity, self.up = description["gravity"], description["up"]
+        self.gravity, self.up, self.background = (description[name] for name in ("gravity", "up", "background"))
+        self.lights = _namespace(description["lights"])
         self.obstacles = [Obstacle(SHAPES[o["shape"]](**o["fields"]), o["name"], **o["look"]) for o in description["obstacles"]]
         self.poses = {}
         self.take_poses({o["name"]: o["pose"] for o in description["obstacles"] if o["pose"] is not None})

@@ -63,7 +63,7 @@ class SceneView:
     ):
         self.camera = camera or Viewpoint.framing(framed_points(scene), size, up=scene.up)
         self._widest = 0.0 if camera else MAX_WIDENING * self.camera.distance  # largest automatic distance [m]; 0: fixed camera
-        self.surfaces = Surfaces(scene)
+        self.surfaces, self._lights = Surfaces(scene), scene.lights
         self.layers = Layers(scene, layers, marks)
         self.colouring = Colouring(scene, self.surfaces, colour, values)
 
@@ -73,7 +73,7 @@ class SceneView:
         bodies = self.surfaces.of_bodies(sim)
         self.camera = self.camera.widened(bodies[0], size, self._widest)
         x, normals = self.surfaces.with_obstacles(bodies, sim.time, self.camera.position)
-        colours = lit_colours(x, normals, self.colouring.base(sim), self.camera)
+        colours = lit_colours(x, normals, self.colouring.base(sim), self.camera, self._lights)
         return x, colours, self.layers.lines(sim, self.camera)
 
 
@@ -81,7 +81,7 @@ class Surfaces:
     """All drawn surfaces as one triangle mesh of fixed topology and colours.
 
     scene: its bodies and obstacles are read once. triangles: int32 (t,3) of drawn vertices, and body_triangles those of bodies
-    without markers; colours: float (n,3), unshaded sRGB.
+    without markers; colours: float (n,3), unshaded sRGB; opacities (n,), those of bodies first, or None if all are 1.
     """
 
     def __init__(self, scene):
@@ -99,6 +99,8 @@ class Surfaces:
         firsts = np.cumsum([0] + [len(part.colours) for part in parts])  # drawn vertex of each part
         self.triangles = np.concatenate([part.triangles + n for part, n in zip(parts, firsts)]).astype(np.int32)
         self.colours = np.concatenate([part.colours for part in parts])
+        opacities = [one.opacity for one in (*scene.bodies, *scene.obstacles)]
+        self.opacities = np.repeat(opacities, np.diff(firsts)) if min(opacities) < 1.0 else None
         self.n_of_bodies = int(firsts[len(self._bodies)])  # drawn vertices of bodies, which come first
         self.body_triangles = np.concatenate([part.own_triangles + n for part, n in zip(self._bodies, firsts)]).astype(np.int32)
         ranges = [slice(*ends) for ends in zip(firsts[len(self._bodies) :], firsts[len(self._bodies) + 1 :])]
