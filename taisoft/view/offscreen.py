@@ -57,6 +57,7 @@ class Offscreen(SceneView):
         self._background = background(self.size, scene.background)
         self._raster = Raster(self._samples)
         self._shadows = Shadows(scene, self.surfaces)
+        self._is_transparent = bool((self.surfaces.opacities < 1.0).any())
         self._drawn_at: float | None = None  # time of the latest picture [s]
         self._before: dict = {}  # what was kept before it
 
@@ -95,9 +96,9 @@ class Offscreen(SceneView):
         runtime = open_runtime(*(open_kind() or ("cpu", "f32")), owner="a picture renderer")
         try:
             maps, texels = self._shadows.draw(x, sim.time)
-            attributes = [colours, texels, *([] if self.surfaces.opacities is None else [self.surfaces.opacities])]
-            points, triangles, attributes = self._triangles(x, np.column_stack(attributes), lines)
-            opacities = attributes[triangles[:, 0], N_ATTRIBUTES] if attributes.shape[1] > N_ATTRIBUTES else None
+            attributes = np.column_stack([colours, texels, self.surfaces.opacities])
+            points, triangles, attributes = self._triangles(x, attributes, lines)
+            opacities = attributes[triangles[:, 0], N_ATTRIBUTES] if self._is_transparent else None
             drawn = points, triangles, attributes[:, :N_ATTRIBUTES]
             self._raster.draw(*drawn, self.camera.clipping[0], maps, picture, opacities)
         finally:
@@ -117,7 +118,7 @@ class Offscreen(SceneView):
         if len(ends) == 0:
             return points, triangles, attributes
         corners, bands = stroke(self.camera.project(ends, self._samples), SAMPLES * LINE_WIDTH)
-        unshaded = np.tile([0.0, 0.0, -1.0, 1.0][: attributes.shape[1] - 3], (len(corners), 1))  # and opaque
+        unshaded = np.tile([0.0, 0.0, -1.0, 1.0], (len(corners), 1))  # and opaque
         band_attributes = np.column_stack([np.repeat(line_colours, 2, axis=0), unshaded])
         triangles = np.concatenate([triangles, len(x) + bands])
         return np.concatenate([points, corners]), triangles, np.concatenate([attributes, band_attributes])

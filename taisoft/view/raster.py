@@ -254,9 +254,7 @@ def peel(
             first = ti.i32(ends[tile - 1])
         left, right = tile % columns * TILE, ti.min(tile % columns * TILE + TILE, width) - 1
         top = tile // columns * WIDTH  # in pixels
-        bottom = ti.min(top + WIDTH, picture.shape[0])
-        if first == last:
-            bottom = top
+        bottom = ti.select(first < last, ti.min(top + WIDTH, picture.shape[0]), top)
         for row in range(top, bottom):
             total = ti.Vector([ti.f64(0.0)] * (3 * WIDTH))
             for line in range(SAMPLES * row, SAMPLES * row + SAMPLES):
@@ -269,7 +267,6 @@ def peel(
                     for index in range(first, last):
                         cover(keys, limits, True, listed[index], index - first, line, left, right, edges, planes, boxes)
                     for column in range(TILE):
-                        limits[column] = 0
                         if keys[column] > 0:
                             t = listed[first + ti.i32(keys[column] & ORDINALS)]
                             colour = colour_at(t, left + column + 0.5, line + 0.5, planes, boxes, shadows)
@@ -277,9 +274,8 @@ def peel(
                             for channel in ti.static(range(3)):
                                 total[column // SAMPLES * 3 + channel] += share * colour[channel]
                             behind[column] -= share
-                            if behind[column] > LEAST_LIGHT:
-                                limits[column] = keys[column]
-                                goes_on = True
+                        limits[column] = ti.select(behind[column] > LEAST_LIGHT, keys[column], ti.i64(0))
+                        goes_on = goes_on or limits[column] > 0
                 for column in range(right - left + 1):
                     for channel in ti.static(range(3)):
                         under = ti.f64(picture[row, (left + column) // SAMPLES, channel])

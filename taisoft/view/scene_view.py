@@ -81,7 +81,7 @@ class Surfaces:
     """All drawn surfaces as one triangle mesh of fixed topology and colours.
 
     scene: its bodies and obstacles are read once. triangles: int32 (t,3) of drawn vertices, and body_triangles those of bodies
-    without markers; colours: float (n,3), unshaded sRGB; opacities (n,), those of bodies first, or None if all are 1.
+    without markers; colours: float (n,3), unshaded sRGB; opacities: (n,).
     """
 
     def __init__(self, scene):
@@ -100,7 +100,7 @@ class Surfaces:
         self.triangles = np.concatenate([part.triangles + n for part, n in zip(parts, firsts)]).astype(np.int32)
         self.colours = np.concatenate([part.colours for part in parts])
         opacities = [one.opacity for one in (*scene.bodies, *scene.obstacles)]
-        self.opacities = np.repeat(opacities, np.diff(firsts)) if min(opacities) < 1.0 else None
+        self.opacities = np.repeat(opacities, np.diff(firsts))
         self.n_of_bodies = int(firsts[len(self._bodies)])  # drawn vertices of bodies, which come first
         self.body_triangles = np.concatenate([part.own_triangles + n for part, n in zip(self._bodies, firsts)]).astype(np.int32)
         ranges = [slice(*ends) for ends in zip(firsts[len(self._bodies) :], firsts[len(self._bodies) + 1 :])]
