@@ -45,10 +45,7 @@ class ShadowMesh:
             side = TEXELS // EVERY
             darkness = one.darkness.reshape(side, EVERY, side, EVERY).mean(axis=(1, 3)).reshape(-1, 1)
             triangles.append(self._triangles[darkness[self._triangles, 0].max(axis=1) > FAINT] + len(points) * len(own))
-            normals, base = (
-                np.tile(one.axes[2], (len(own), 1)),
-                np.tile(self._surfaces.colours[one.vertices.start], (len(own), 1)),
-            )
+            normals, base = (np.tile(row, (len(own), 1)) for row in (one.axes[2], self._surfaces.colours[one.vertices.start]))
             colours.append(lit_colours(own, normals, base, camera, self._lights) * (1.0 - darkness))
             points.append(camera.nearer(own, LIFT))
         if not points:
