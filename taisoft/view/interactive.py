@@ -14,7 +14,7 @@ import numpy as np
 import rich
 
 from taisoft.errors import OutputError
-from taisoft.output.appearance import OBSTACLE_COLOUR, compact_surface, linear_rgb, obstacle_surfaces
+from taisoft.output.appearance import compact_surface, linear_rgb, obstacle_colour, obstacle_surfaces
 from taisoft.output.viewpoint import Viewpoint, framed_points
 from taisoft.scene.obstacles import HalfSpace
 from taisoft.view.colouring import Colouring
@@ -111,13 +111,13 @@ class InteractiveView(FramesOnPage):
 
     def _add_obstacles(self, server) -> dict[int, object]:
         """Put the obstacles on a server at the first frame's time; return the handles of those that have triangles, by number."""
-        grey = tuple(np.round(255 * OBSTACLE_COLOUR).astype(int).tolist())
         handles = {}
         for number, surface in enumerate(self._obstacles):
             if len(surface.triangles) == 0:
                 continue
             x, faces = self._moved[0].get(number, surface.vertices.astype(np.float32)), surface.triangles.astype(np.uint32)
             side = "front" if isinstance(surface.obstacle.shape, HalfSpace) else "double"  # walls do not hide what they hold
-            added = server.scene.add_mesh_simple(f"/obstacles/{number}", x, faces, color=grey, flat_shading=True, side=side)
+            colour = tuple(np.round(255 * obstacle_colour(surface.obstacle)).astype(int).tolist())
+            added = server.scene.add_mesh_simple(f"/obstacles/{number}", x, faces, color=colour, flat_shading=True, side=side)
             handles[number] = added
         return handles
