@@ -11,7 +11,7 @@ from taisoft.backend.runtime import open_kind, open_runtime
 from taisoft.errors import OutputError, SimulationError
 from taisoft.mesh.placing import FROM_Y_UP
 from taisoft.output.viewpoint import Viewpoint, start_positions
-from taisoft.view.colouring import COLOURS, Colouring, round_up
+from taisoft.view.colouring import COLOURS, Colouring, lit_colours, round_up
 from taisoft.view.ggui import Canvas
 from taisoft.view.offscreen import Offscreen, stroke
 from taisoft.view.raster import Raster
@@ -271,8 +271,9 @@ def test_a_process_has_one_window_which_leaves_no_files(tmp_path, monkeypatch):
 def test_the_window_blends_transparent_surfaces_from_far_to_near():
     """As pictures do, to a few pixels, in whatever order the bodies were added."""
     for scene in (walls(0.5), walls(0.5)):
-        drawing = Offscreen(scene, SIZE, FRONT, layers=())
-        x, colours, lines = drawing._drawn(FakeSimulator(scene), SIZE)
+        drawing = Offscreen(scene, SIZE, FRONT)
+        x, normals = drawing.surfaces.with_obstacles(drawing.surfaces.of_bodies(FakeSimulator(scene)), 0.0, FRONT.position)
+        colours, lines = lit_colours(x, normals, drawing.surfaces.colours, FRONT), (np.zeros((0, 3)), np.zeros((0, 3)))
         canvas = Canvas(drawing.surfaces, SIZE, visible=False)
         try:
             canvas.draw(x, colours, FRONT, (1, 1, 1), lines)
