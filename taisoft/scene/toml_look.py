@@ -29,8 +29,7 @@ def look_tables(scene: Scene, fields: Callable) -> dict:
     tables: dict = {}
     if scene.background is not None:
         two = [colour_value(colour) for colour in scene.background]
-        mixed = scene.background if any(isinstance(one, np.ndarray) for one in two) else two
-        tables["background"] = two[0] if np.array_equal(*scene.background) else mixed
+        tables["background"] = two[0] if np.array_equal(*scene.background) else two
     if scene.lights is not None:
         tables["lights"] = [fields(one) | {"colour": colour_value(one.colour)} for one in scene.lights] or ()
     if scene.camera is not None:

@@ -84,12 +84,13 @@ class Raster:
             raise OutputError(f"a picture cannot show {n} triangles of this size: they cover too many tiles of the picture")
         if self._ends[-1] > len(self._listed):
             self._listed = np.empty(min(int(1.25 * self._ends[-1]), MAX_LISTED), dtype=np.int32)
+        enlist(n, self._columns, self._boxes, self._ends, self._listed)
         if opacities is not None:
-            peel(n, self.size[0], self._columns, *of_triangles, self._listed, opacities, shadows, picture)
+            peel(self.size[0], self._columns, *of_triangles, self._listed, opacities, shadows, picture)
             return
         has_picture, has_depths = picture is not None, depths is not None
         images = picture if has_picture else np.zeros((1, 1, 3), np.uint8), depths if has_depths else np.zeros((1, 1))
-        sizes = n, self.size[0], self._columns, has_picture, has_depths
+        sizes = self.size[0], self._columns, has_picture, has_depths
         draw(*sizes, *of_triangles, self._listed, shadows, *images)
 
 
@@ -179,8 +180,20 @@ def set_up(
 
 
 @kernel(cse=False)
+def enlist(n: ti.i32, columns: ti.i32, boxes: ARRAY, ends: ARRAY, listed: ARRAY):
+    """List the first n triangles by tile. ends: a list's beginning becomes its end, which is the next one's beginning."""
+    ti.loop_config(serialize=True)
+    for t in range(n):
+        if boxes[t, 2] <= boxes[t, 3]:
+            for row in range(boxes[t, 2] // TILE, boxes[t, 3] // TILE + 1):
+                for column in range(boxes[t, 0], boxes[t, 1] + 1):
+                    tile = row * columns + column
+                    listed[ti.i32(ends[tile])] = t
+                    ends[tile] = ends[tile] + 1
+
+
+@kernel(cse=False)
 def draw(
-    n: ti.i32,
     width: ti.i32,
     columns: ti.i32,
     has_picture: ti.i32,
@@ -194,15 +207,10 @@ def draw(
     picture: ARRAY,
     depths: ARRAY,
 ):
-    """List the first n triangles by tile, and draw tile by tile: colours into picture, and 1/depth into depths.
+    """Draw tile by tile: colours into picture, and 1/depth into depths.
 
-    ends: the beginning of every tile's list becomes its end, which is the next one's beginning. A tile is drawn by pairs of rows,
-    whose keys are local vectors: its z-buffer needs no memory.
+    A tile is drawn by pairs of rows, whose keys are local vectors: its z-buffer needs no memory.
     """
-    ti.loop_config(serialize=True)
-    for t in range(n):
-        enlist(t, columns, boxes, ends, listed)
-
     for tile in range(ends.shape[0] - 1):
         first, last = 0, ti.i32(ends[tile])
         if tile > 0:
@@ -231,7 +239,6 @@ def draw(
 
 @kernel(cse=False)
 def peel(
-    n: ti.i32,
     width: ti.i32,
     columns: ti.i32,
     edges: ARRAY,
@@ -243,11 +250,7 @@ def peel(
     shadows: ARRAY,
     picture: ARRAY,
 ):
-    """Draw the first n triangles as `draw` does, with their opacities: the layers of every sample from front to back."""
-    ti.loop_config(serialize=True)
-    for t in range(n):
-        enlist(t, columns, boxes, ends, listed)
-
+    """Draw tile by tile as `draw` does, with opacities: the layers of every sample from front to back."""
     for tile in range(ends.shape[0] - 1):
         first, last = 0, ti.i32(ends[tile])
         if tile > 0:
@@ -284,17 +287,6 @@ def peel(
                 for channel in ti.static(range(3)):
                     mean = total[3 * column + channel] / SAMPLES**2
                     picture[row, left // SAMPLES + column, channel] = ti.u8(ti.i32(mean + 0.5))
-
-
-@ti.func
-def enlist(t, columns, boxes: ti.template(), ends: ti.template(), listed: ti.template()):
-    """Append triangle t to the lists of the tiles that its box meets; `ends` are where the next entries go."""
-    if boxes[t, 2] <= boxes[t, 3]:
-        for row in range(boxes[t, 2] // TILE, boxes[t, 3] // TILE + 1):
-            for column in range(boxes[t, 0], boxes[t, 1] + 1):
-                tile = row * columns + column
-                listed[ti.i32(ends[tile])] = t
-                ends[tile] = ends[tile] + 1
 
 
 @ti.func
