@@ -45,6 +45,7 @@ BAD = [
     ('axes = "y"', 'axes = "x"', ""),
     ('nodes = [8, 9]\naxes = "y"', 'nodes = [1]\naxes = "x"', "bodies.beam.move[0]: node 1 is already fixed along x"),
     ("times = [0, 1]", "times = [0]", "bodies.beam.move[0].path.translations must have shape (1, 3), not (2, 3)"),
+    ("path = { times = [0, 1], translations = [[0, 0, 0], [0, 0.5, 0]], release = true }", "", ""),
     ("release = true", "release = 1", "bodies.beam.move[0].path.release must be True or False"),
     ('"half_space"', '"plane"', "obstacles.ground.shape must be one of half_space, sphere, box, capsule, mesh"),
     ('shape = "half_space"', "", "obstacles.ground.shape is missing"),

@@ -218,6 +218,8 @@ def test_a_transparent_body_shows_what_is_behind_it():
     assert np.abs(Offscreen(scene, SIZE, FRONT).image(FakeSimulator(scene)) - images[1]).max() <= 1
     surfaces = Surfaces(scene)
     assert set(surfaces.opacities[(surfaces.colours == MARKER_COLOUR).all(axis=1)]) == {0.6, 1.0}
+    wired = Offscreen(walls(0.05), SIZE, FRONT, layers=("wires",)).image(FakeSimulator(scene))
+    assert (wired.max(axis=2) < 60).any(), "lines are opaque"
     ground, clear = ((Offscreen(scene, SIZE, FRONT).image(FakeSimulator(scene))) for scene in (walls(1.0), walls(1.0, 0.1)))
     low = ground[-20:].astype(int) - clear[-20:]
     assert (low[..., 0] < -50).all() and (low[..., 1] < 50).all(), "the light background comes through"
