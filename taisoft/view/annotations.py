@@ -26,6 +26,7 @@ CURVE_HEIGHT, MIN_CURVE_HEIGHT = 92, 40  # the smaller one if there are many plo
 SAMPLES = 2  # per pixel and axis
 INK, FAINT, FRAME, PAPER = (38, 41, 46), (112, 116, 122), (160, 163, 168), (252, 252, 253)  # sRGB
 GRID = (222, 224, 226)
+DARK = 100  # mean value of the picture's lower left corner below which text on it is light
 OPACITY = 0.86  # of the plots' background
 BAR, BAR_HEIGHT = (220, 12), 64  # width and height of the colour bar; height with its texts
 
@@ -58,6 +59,7 @@ class Annotations:
         """Return an annotated copy of a picture, uint8 (height, width, 3), of a state; index: frame number."""
         height, width = picture.shape[:2]
         self._unit = SAMPLES * height / HEIGHT  # drawn pixels per unit of length
+        self._on_dark = picture[-(height // 4) :, : width // 3].mean() < DARK
         size = width * HEIGHT / height, HEIGHT
         names = self._plots.visible() if self._plots is not None else []
         result = picture.copy()
@@ -76,7 +78,7 @@ class Annotations:
 
     def _bar_layer(self, legend: list[tuple[str, np.ndarray]], bottom: float, blank):
         """Return the colour bar as a layer; it is drawn again only when the legend or the size of the pictures changes."""
-        key = self._colouring.kind, *(text for text, _ in legend), blank.size
+        key = self._on_dark, self._colouring.kind, *(text for text, _ in legend), blank.size
         if self._bar is None or self._bar[0] != key:
             self._draw_colour_bar(legend, bottom)
             self._bar = key, blank.reduce(SAMPLES)
@@ -191,7 +193,9 @@ class Annotations:
         self, x: float, y: float, text: str, size: float, colour: tuple[int, int, int], anchor: str = "la", halo: bool = False
     ) -> None:
         """Write text at x, y. anchor: the part of the text at that point, in Pillow's notation; halo: outline the letters."""
-        edge = {"stroke_width": round(1.5 * self._unit), "stroke_fill": (*PAPER, 200)} if halo else {}
+        swapped = halo and colour == INK and self._on_dark
+        colour, outline = (PAPER, INK) if swapped else (colour, PAPER)
+        edge = {"stroke_width": round(1.5 * self._unit), "stroke_fill": (*outline, 200)} if halo else {}
         position = tuple((self._unit * np.array([x, y]) - self._origin).tolist())
         self._pen.text(position, text, (*colour, 255), _font(self._font_file, round(size * self._unit)), anchor, **edge)
 

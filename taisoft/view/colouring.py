@@ -7,7 +7,8 @@ an impact.
 
 Shading is computed per drawn vertex on the host, so that it is the same in pictures and in the window:
 colour = base * (hemisphere of sky and ground light + key light + fill light) * darkening at grazing angles, which emphasizes
-silhouettes. The lamps move with the camera, so that every view is lit alike.
+silhouettes. The lamps move with the camera, so that every view is lit alike. A scene's own lights replace both: each adds
+strength * its colour * max(0, -direction . n).
 """
 
 import math
@@ -42,7 +43,7 @@ COLOURS = np.array([(0.27, 0.42, 0.80), (0.33, 0.70, 0.78), (0.72, 0.82, 0.45), 
 LAMPS = ((np.array([-0.35, 0.60, 0.72]), 0.72), (np.array([0.85, 0.15, 0.45]), 0.22))  # direction (right, up, back), strength
 SKY, GROUND = np.array([0.44, 0.46, 0.49]), np.array([0.26, 0.25, 0.24])
 EDGE_DARKENING = 0.22
-BACKGROUND_TOP, BACKGROUND_BOTTOM = np.array([0.95, 0.955, 0.96]), np.array([0.80, 0.81, 0.82])  # sRGB
+BACKGROUND = np.array([(0.95, 0.955, 0.96), (0.80, 0.81, 0.82)])  # sRGB, at the top and the bottom
 
 
 def checked_colour(kind: str) -> str:
@@ -129,13 +130,19 @@ def round_up(value: float) -> float:
     return next((k * power for k in (1.0, 2.0, 5.0) if k * power >= value * (1.0 - 1e-12)), 10.0 * power)
 
 
-def lit_colours(x: np.ndarray, normals: np.ndarray, base: np.ndarray, camera: Viewpoint) -> np.ndarray:
-    """Return shaded colours (n,3) in [0, 1] of vertices x (n,3) with unit normals (n,3) and base colours (n,3) for a camera."""
+def lit_colours(x: np.ndarray, normals: np.ndarray, base: np.ndarray, camera: Viewpoint, lights=None) -> np.ndarray:
+    """Return shaded colours (n,3) in [0, 1] of vertices x (n,3) with unit normals (n,3) and base colours (n,3) for a camera.
+
+    lights: of the scene, or None for the lamps of the camera.
+    """
     right, up, forward = camera.axes
     frame = np.array([right, up, -forward])
     light = GROUND + (SKY - GROUND) * (0.5 + 0.5 * normals @ UP[camera.up])[:, None]
-    for lamp, strength in LAMPS:
-        direction = (lamp / np.linalg.norm(lamp)) @ frame
+    if lights is None:
+        lamps = [((lamp / np.linalg.norm(lamp)) @ frame, strength) for lamp, strength in LAMPS]
+    else:
+        lamps = [(-one.direction, one.strength * one.colour) for one in lights]
+    for direction, strength in lamps:
         light = light + strength * np.clip(normals @ direction, 0.0, None)[:, None]
     to_eye = camera.position - x
     to_eye /= np.linalg.norm(to_eye, axis=1, keepdims=True)
@@ -143,9 +150,13 @@ def lit_colours(x: np.ndarray, normals: np.ndarray, base: np.ndarray, camera: Vi
     return np.clip(base * light * (1.0 - EDGE_DARKENING * grazing)[:, None], 0.0, 1.0)
 
 
-def background(size: tuple[int, int]) -> np.ndarray:
-    """Return a neutral vertical gradient, uint8 (height, width, 3), for size (width, height)."""
+def background(size: tuple[int, int], colours: np.ndarray | None = None) -> np.ndarray:
+    """Return a vertical gradient, uint8 (height, width, 3), for size (width, height).
+
+    colours: sRGB (2,3) at the top and the bottom; by default light grey.
+    """
     width, height = size
+    top, bottom = BACKGROUND if colours is None else colours
     mix = np.linspace(0.0, 1.0, height)[:, None] ** 1.5
-    column = BACKGROUND_TOP + (BACKGROUND_BOTTOM - BACKGROUND_TOP) * mix
+    column = top + (bottom - top) * mix
     return np.repeat(np.round(255 * column).astype(np.uint8)[:, None], width, axis=1)

@@ -61,7 +61,7 @@ class SceneView:
         self._widest = 0.0  # largest automatic distance [m]; 0: the camera does not move back
         if self.camera is None:
             self.look_from(size)
-        self.surfaces = Surfaces(self.scene)
+        self.surfaces, self._lights = Surfaces(self.scene), self.scene.lights
         self.layers = Layers(self.scene, layers)
         self.colouring = Colouring(self.surfaces, colour)
 
@@ -90,7 +90,7 @@ class SceneView:
             self.camera = camera_viewpoint(self.scene, state.time, state.x)
         self.camera = self.camera.widened(bodies[0], size, self._widest, self._free(size))
         x, normals = self.surfaces.with_obstacles(bodies, state, self.camera.position)
-        colours = lit_colours(x, normals, self.colouring.base(state), self.camera)
+        colours = lit_colours(x, normals, self.colouring.base(state), self.camera, self._lights)
         return x, colours, self.layers.lines(state, self.camera)
 
 
@@ -98,7 +98,7 @@ class Surfaces:
     """All drawn surfaces as one triangle mesh of fixed topology and colours.
 
     scene: a Scene, which is read once, or what is drawn of one. triangles: int32 (t,3) of drawn vertices, and body_triangles
-    those of bodies without markers; colours: float (n,3), unshaded sRGB.
+    those of bodies without markers; colours: float (n,3), unshaded sRGB; opacities: (n,).
     """
 
     def __init__(self, scene):
@@ -117,6 +117,8 @@ class Surfaces:
         firsts = np.cumsum([0] + [len(part.colours) for part in parts])  # drawn vertex of each part
         self.triangles = np.concatenate([part.triangles + n for part, n in zip(parts, firsts)]).astype(np.int32)
         self.colours = np.concatenate([part.colours for part in parts])
+        opacities = [one.opacity for one in (*scene.bodies, *scene.obstacles)]
+        self.opacities = np.repeat(opacities, np.diff(firsts))
         self.n_of_bodies = int(firsts[len(self._bodies)])  # drawn vertices of bodies, which come first
         self.body_triangles = np.concatenate([part.own_triangles + n for part, n in zip(self._bodies, firsts)]).astype(np.int32)
         ranges = [slice(*ends) for ends in zip(firsts[len(self._bodies) :], firsts[len(self._bodies) + 1 :])]

@@ -214,6 +214,8 @@ def test_a_caption_is_at_the_bottom(monkeypatch):
     left, top, right, bottom = bounds(plain, grey())
     assert left < 12 and 190 < right < 340 and 318 < top < 336 and bottom <= 355
     assert not np.array_equal(Annotations(name="bücher").draw(grey(), state, 8), plain), "frame number"
+    dark = Annotations(name="bücher").draw(grey() // 4, state, 7)
+    assert plain.min() < 60 and plain.max() < 230 and dark.max() > 240, "light text on dark pictures"
     both = Annotations(filled(), "beam").draw(grey(), state, 0)
     assert (both[10:280, : SIZE[0] - 160] == 120).all(), "the bodies stay visible"
     monkeypatch.setattr(annotations, "find_spec", lambda name: None if name == "PIL" else 1)
