@@ -4,8 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from taisoft.scene import checks
-from taisoft.scene.look import Camera, Light, colour_of
+from taisoft.scene.look import Camera, Light, check_follow, colour_of
 from taisoft.scene.scene import Scene
 from taisoft.scene.tables import Table, arguments_of
 
@@ -20,8 +19,7 @@ def read_look(scene: Scene, tables: Table) -> None:
             scene.lights = [one.make(Light, "light: ") for one in tables.listed("lights", *arguments_of(Light))]
         if "camera" in tables:
             scene.camera = tables.made("camera", Camera, "camera: ")
-            if scene.camera.follow is not None:
-                checks.index(scene.camera.follow, [body.name for body in scene.bodies], "camera.follow: no body")
+            check_follow(scene.camera, scene.bodies)
 
 
 def look_tables(scene: Scene, fields: Callable) -> dict:

@@ -63,7 +63,7 @@ BAD = [
     ("[collision]", "[[lights]]\nstrength = 1\n[collision]", "lights[0].direction is missing"),
     ("[collision]", "[lights]\n[collision]", "lights must be a list of tables [[lights]], not a table"),
     ("[collision]", "[camera]\nposition = [[0, 0, 1], [0, 0, 2]]\ntimes = [1, 1]\n[collision]", "camera.times must ascend"),
-    ("[collision]", "[camera]\nposition = [0, 0, 1]\nfollow = 'beem'\n[collision]", "camera.follow: no body is called 'beem'"),
+    ("[collision]", "[camera]\nposition = [0, 0, 1]\nfollow = 'beem'\n[collision]", "camera: follow: no body is called 'beem'"),
     ("friction = 0.9", 'colour = "#12345g"', "obstacles.ground.colour must be '#rrggbb'"),
     ("friction = 0.9", "opacity = 0", "obstacles.ground.opacity must be at least 0.02 and at most 1, not 0"),
     ("position = [0, 3, 0]", "colour = [0, 1]", 'bodies."the ball".colour must have shape (3,), not (2,)'),
