@@ -13,26 +13,61 @@ from taisoft.errors import MeshError, one_line
 from taisoft.mesh.safe_reading import content_lines
 from taisoft.mesh.words import to_float, to_int
 
+RULES = {"v": "v and three coordinates", "vt": "vt and one or two numbers"}  # of .obj
+RULES["f"] = "f and at least 3 corners, all or none of them with a vt"
 HEAD = re.compile(r"(?:ST)?C?N?OFF(\d*)$")  # of .off; some programs write no space before the counts
 
 
-def read_obj(name: str, data: bytes) -> tuple[np.ndarray, list[np.ndarray]]:
-    """Return positions and polygons, (1,k) each, of a Wavefront file."""
-    points, polygons = [], []
+def read_obj(name: str, data: bytes) -> tuple[np.ndarray, list[np.ndarray], list[np.ndarray] | None, dict[str, list[int]]]:
+    """Return positions, polygons, (1,k) each, their UVs, (1,k,2) each, and subsets of polygons by name, of a Wavefront file.
+
+    UVs are NaN at polygons without any, and None if none has some. Subsets are those of `usemtl`, else of `g`, else of `o`.
+    """
+    points, polygons, texture, textured = [], [], [], []  # textured: line, UVs so far and numbers of UVs of each polygon
+    current, members = dict.fromkeys(("usemtl", "g", "o"), ""), {"usemtl": {}, "g": {}, "o": {}}
     for number, words in content_lines(name, data):
         try:
             if words[0] == "v":
                 x, y, z = words[1:4]
                 points.append((to_float(x), to_float(y), to_float(z)))
+            elif words[0] == "vt":
+                u, v = (*words[1:3], "0")[:2]
+                texture.append((to_float(u), to_float(v)))
+            elif words[0] in current:
+                current[words[0]] = " ".join(words[1:])
             elif words[0] == "f":
-                corners = [to_int(word.split("/", 1)[0]) for word in words[1:]]
-                if len(corners) < 3 or 0 in corners or max(map(abs, corners)) > len(data):
+                corners, *rest = zip(*(_corner(word) for word in words[1:]), strict=True)
+                given = [k for ks in (corners, *rest) for k in ks]
+                if len(corners) < 3 or 0 in given or max(map(abs, given)) > len(data):
                     raise ValueError
+                for kind, called in current.items():
+                    if called:
+                        members[kind].setdefault(called, []).append(len(polygons))
                 polygons.append(np.array([[k - 1 if k > 0 else len(points) + k for k in corners]]))
+                textured.append((number, len(texture), rest[0] if rest else ()))
         except ValueError:
-            rule = "v and three coordinates, or f and at least 3 corners"
-            raise MeshError(f"{name}: line {number}: expected {rule}, not {one_line(' '.join(words))!r}") from None
-    return np.array(points, dtype=np.float64).reshape(-1, 3), polygons
+            raise MeshError(f"{name}: line {number}: expected {RULES[words[0]]}, not {one_line(' '.join(words))!r}") from None
+    uvs = _uvs_of(name, texture, textured, polygons) if any(ks for *_, ks in textured) else None
+    subsets = next((of for of in members.values() if of), {})
+    return np.array(points, dtype=np.float64).reshape(-1, 3), polygons, uvs, subsets
+
+
+def _corner(word: str) -> tuple[int, ...]:
+    """Return the numbers of a corner's v and, if it is given, its vt."""
+    position, *texture = word.split("/")[:2]
+    return (to_int(position), *(to_int(k) for k in texture if k))
+
+
+def _uvs_of(name: str, texture: list, textured: list, polygons: list[np.ndarray]) -> list[np.ndarray]:
+    """Return the UVs of polygons, see `read_obj`."""
+    found, rows = [], np.array(texture).reshape(-1, 2)
+    for (number, so_far, ks), nodes in zip(textured, polygons):
+        at = [k - 1 if k > 0 else so_far + k for k in ks]
+        for k, row in zip(ks, at):
+            if not 0 <= row < len(rows):
+                raise MeshError(f"{name}: line {number}: vt {k} does not exist ({len(rows)} are given)")
+        found.append(rows[at][None] if at else np.full((*nodes.shape, 2), np.nan))
+    return found
 
 
 def read_off(name: str, data: bytes) -> tuple[np.ndarray, list[np.ndarray]]:

@@ -148,12 +148,16 @@ def greatest_depth(vertices: np.ndarray, triangles: np.ndarray, points: np.ndarr
 
 def nearest_points(vertices: np.ndarray, triangles: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the nearest points (k,3) [m] of triangles (t,3), which may be open, to points (k,3), and their triangles (k,)."""
-    surface = _Triangles(vertices, triangles)
-    point, triangle = surface.balls.pairs(points, surface.upper(points))
-    squared, offset, _ = surface.nearest(points[point], triangle)
-    order = np.lexsort((triangle, squared, point))
-    best = order[np.searchsorted(point[order], np.arange(len(points)))]
-    return points - offset[best], triangle[best]
+    surface, nearest, found = _Triangles(vertices, triangles), points.copy(), np.zeros(len(points), dtype=np.int64)
+    for first in range(0, len(points), _CHUNK):
+        at = slice(first, first + _CHUNK)
+        point, triangle = surface.balls.pairs(points[at], surface.upper(points[at]))
+        squared, offset, _ = surface.nearest(points[at][point], triangle)
+        order = np.lexsort((triangle, squared, point))
+        best = order[np.searchsorted(point[order], np.arange(len(points[at])))]
+        nearest[at] -= offset[best]
+        found[at] = triangle[best]
+    return nearest, found
 
 
 class BallTree:

@@ -1,0 +1,109 @@
+"""Texture coordinates and subsets of triangle surfaces: how they are checked, cut, and passed on to another surface.
+
+Texture coordinates (UVs) belong to the corners of triangles, so a vertex on a seam has several. Triangles that meet at an edge
+with the same UVs at both its ends are in one chart. Subsets are named sets of triangles, such as those of one material; no
+triangle is in two.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+
+from taisoft.errors import MeshError, value_text
+from taisoft.mesh.sdf import nearest_points
+from taisoft.mesh.topology import HALF_EDGES, linked_groups, normals_and_heights
+
+
+def checked_uvs(uvs, n: int, error: Callable[[str], MeshError]) -> np.ndarray | None:
+    """Return read-only UVs (n,3,2) float64 of n triangles, or None for None. error: makes an error of its text."""
+    if uvs is None:
+        return None
+    array = np.array(uvs)
+    if array.shape != (n, 3, 2) or array.dtype.kind not in "fiu":
+        raise error(f"uvs must be numbers of shape ({n}, 3, 2), two for each corner, not {array.dtype} of shape {array.shape}")
+    bad = np.argwhere(~np.isfinite(array))
+    if len(bad):
+        raise error(f"uvs of triangle {bad[0, 0]}, corner {bad[0, 1]} are not finite")
+    array = array.astype(np.float64)
+    array.setflags(write=False)
+    return array
+
+
+def checked_subsets(subsets, n: int, error: Callable[[str], MeshError]) -> dict[str, np.ndarray]:
+    """Return subsets of n triangles, ascending and read-only. error: makes an error of its text."""
+    taken, found = np.zeros(n, dtype=bool), {}
+    for name, given in dict(subsets or {}).items():
+        if not isinstance(name, str) or not name:
+            raise error(f"a subset's name must be text, not {value_text(name)}")
+        ids = np.unique(np.asarray(given))
+        if np.ndim(given) != 1 or (len(ids) and ids.dtype.kind not in "iu"):
+            raise error(f"subset {name!r} must be triangles' numbers, not {value_text(given)}")
+        ids = ids.astype(np.int64)
+        if len(ids) and not 0 <= ids[0] <= ids[-1] < n:
+            raise error(f"subset {name!r}: triangle {ids[0] if ids[0] < 0 else ids[-1]} does not exist ({n} triangles)")
+        if taken[ids].any():
+            raise error(f"subset {name!r}: triangle {ids[taken[ids].argmax()]} is in another subset too")
+        taken[ids] = True
+        ids.setflags(write=False)
+        found[name] = ids
+    return found
+
+
+def subsets_of(subsets: dict[str, np.ndarray], rows: np.ndarray) -> dict[str, np.ndarray]:
+    """Return subsets of new triangles, each of which is a part of the old triangle rows (k,); empty ones are left out."""
+    found = {name: np.flatnonzero(np.isin(rows, ids)) for name, ids in subsets.items()}
+    return {name: ids for name, ids in found.items() if len(ids)}
+
+
+def split_uvs(uvs: np.ndarray) -> np.ndarray:
+    """Return the UVs (4t,3,2) of the four parts of each triangle (t,3,2), in the order of `taisoft.mesh.nodes.make_nodes`."""
+    (a, b, c), (ab, bc, ca) = np.moveaxis(uvs, 1, 0), np.moveaxis(0.5 * (uvs + np.roll(uvs, -1, axis=1)), 1, 0)
+    return np.stack([a, ab, ca, ab, b, bc, ca, bc, c, ab, bc, ca], axis=1).reshape(-1, 3, 2)
+
+
+def charts(triangles: np.ndarray, uvs: np.ndarray) -> np.ndarray:
+    """Return the chart (t,) of each triangle (t,3) with UVs (t,3,2), from 0."""
+    corner = np.unique(np.column_stack([triangles.reshape(-1), uvs.reshape(-1, 2)]), axis=0, return_inverse=True)[1]
+    ends = np.sort(corner.reshape(-1, 3)[:, HALF_EDGES].reshape(-1, 2), axis=1)
+    edges, edge = np.unique(ends, axis=0, return_inverse=True)
+    t = len(triangles)
+    label = linked_groups(np.repeat(np.arange(t), 3), t + edge.ravel(), t + len(edges))[1][:t]
+    return np.unique(label, return_inverse=True)[1]
+
+
+def transferred(surface, vertices: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray | None, dict[str, np.ndarray]]:
+    """Return UVs (t,3,2), or None, and subsets of triangles (t,3) near a `SurfaceMesh`.
+
+    vertices: (n,3) [m]. A triangle gets the subset and the chart of the triangle nearest to its centroid. Its corners get the
+    UVs of the nearest points of that chart, so it is not stretched across a seam: where it crosses one, it ends at the seam.
+    """
+    if surface.uvs is None and not surface.subsets:
+        return None, {}
+    with_area = np.flatnonzero(normals_and_heights(surface.vertices, surface.triangles)[1] > 0.0)
+    source = with_area[_nearest(surface, with_area, vertices[triangles].mean(axis=1))[1]]
+    subsets = subsets_of(surface.subsets, source)
+    if surface.uvs is None:
+        return None, subsets
+    chart, uvs = charts(surface.triangles, surface.uvs), np.empty((len(triangles), 3, 2))
+    for one in np.unique(chart[source]):
+        rows, own = np.flatnonzero(chart[source] == one), with_area[chart[with_area] == one]
+        used, corner = np.unique(triangles[rows], return_inverse=True)
+        point, at = _nearest(surface, own, vertices[used])
+        weights = _barycentric(surface.vertices[surface.triangles[own[at]]], point)
+        uvs[rows] = np.einsum("pk,pkx->px", weights, surface.uvs[own[at]])[corner.reshape(-1, 3)]
+    return uvs, subsets
+
+
+def _nearest(surface, rows: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the points (p,3) [m] of triangles `rows` nearest to points (p,3), and the index in rows of each (p,)."""
+    return nearest_points(surface.vertices, surface.triangles[rows], points)
+
+
+def _barycentric(corners: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Return the barycentric coordinates (p,3) of points (p,3) in triangles (p,3,3)."""
+    b, c, x = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0], points - corners[:, 0]
+    normal = np.cross(b, c)
+    squared = np.einsum("px,px->p", normal, normal)
+    u, v = (np.einsum("px,px->p", np.cross(*pair), normal) / squared for pair in ((x, c), (b, x)))
+    weights = np.clip(np.stack([1.0 - u - v, u, v], axis=1), 0.0, 1.0)
+    return weights / weights.sum(axis=1, keepdims=True)
