@@ -30,12 +30,15 @@ from taisoft.mesh.usd_content import usd_message
 from taisoft.output.files import make_folder, output_errors
 from taisoft.output.nodal_fields import UNKNOWN_ERROR, NodalMean, von_mises
 from taisoft.output.usd_curves import TENSION
-from taisoft.output.usd_scene import ERROR, IMPULSE, ROOT, STRESS, TRANSLATE, scene_layer
+from taisoft.output.usd_scene import CLIPPING, FOCAL, TRANSFORM, TRANSLATE, scene_layer
+from taisoft.output.usd_surface import ERROR, IMPULSE, NORMALS, ROOT, STRESS, VELOCITIES
 
 SCENE_NAME = "scene.usdc"
 CHUNKS_NAME = "chunks"
 SAME_FRAME = 1e-8  # relative error of a frame's time, from the rounding of dt and of its sum, that its time code does not show
-TIME_VARYING = {"points", "extent", TRANSLATE, *(f"primvars:{name}" for name in (STRESS, IMPULSE, ERROR, TENSION))}  # attributes
+INSTANT = 0.01  # of a frame: the time over which the velocity of an obstacle on a path is a difference
+TIME_VARYING = {"points", "extent", VELOCITIES, NORMALS, STRESS, IMPULSE, ERROR, f"primvars:{TENSION}"}  # attributes
+TIME_VARYING |= {TRANSLATE, TRANSFORM, FOCAL, CLIPPING}  # of the camera
 
 
 class UsdWriter:
@@ -97,29 +100,29 @@ class UsdWriter:
 
     def frame(self, sim, index: int) -> None:
         """Record sim's state as frame index, which must ascend; the first, if not 0, counts from time 0. Raises OutputError."""
-        from pxr import Gf, Sdf
+        from pxr import Sdf
 
         moving = [one for one in self._obstacles if one[1].obstacle.path is not None or one[0] in self._moved]
-        moved = [(track, surface.at(sim.time).astype(np.float32)) for track, surface in moving]  # first, since it may raise
+        moved = [(track, surface.at(sim.time), self._velocities(surface, sim.time)) for track, surface in moving]  # it may raise
         x = sim.positions()
         curves = [] if self._curves is None else self._curves.samples(sim, x)
         if self._chunk is None:
             self._chunk = Sdf.Layer.CreateAnonymous(".usdc")
             self._chunk.TransferContent(self._template)
-        points, fields = x.astype(np.float32), {STRESS: von_mises(self._mean(sim.stress())).astype(np.float32)}
+        fields = {STRESS: von_mises(self._mean(sim.stress())), VELOCITIES: sim.velocities()}
         if self._touching:
-            fields[IMPULSE] = nodal_impulses(sim.contacts(), len(x)).astype(np.float32)
+            fields[IMPULSE] = nodal_impulses(sim.contacts(), len(x))
         if self._errors:
-            fields[ERROR] = np.nan_to_num(sim.nodal_errors(), nan=UNKNOWN_ERROR).astype(np.float32)
-        samples = [(self._view.attribute, Gf.Vec3d(*self._view.follow(x).tolist()))]
+            fields[ERROR] = np.nan_to_num(sim.nodal_errors(), nan=UNKNOWN_ERROR)
+        samples = self._view.samples(sim.time, x)
         for track in self._tracks:
-            samples += track.samples(points, fields)
-        for track, corners in moved:
-            samples += track.samples(corners, {})
+            samples += track.samples(x, fields)
+        for track, corners, velocities in moved:
+            samples += track.samples(corners, {VELOCITIES: velocities})
         samples += curves
         for track, surface in moving:
             if track not in self._moved and self._latest >= 0.0:  # commanded since the frame before, where it was at rest
-                for path, value in track.samples(surface.vertices.astype(np.float32), {}):
+                for path, value in track.samples(surface.vertices, {VELOCITIES: np.zeros_like(surface.vertices)}):
                     self._chunk.SetTimeSample(path, self._latest, value)
             self._moved.add(track)
         if index == 0:
@@ -131,6 +134,11 @@ class UsdWriter:
         self._codes.append(self._latest)
         if len(self._codes) >= self.chunk_frames:
             self._publish_chunk()
+
+    def _velocities(self, surface, t: float) -> np.ndarray:
+        """Return the velocities (n,3) [m/s] of an obstacle's vertices at time t [s], just before it; at 0 just after it."""
+        h = INSTANT / self._fps
+        return (surface.at(max(t, h)) - surface.at(max(t - h, 0.0))) / h
 
     def close(self) -> None:
         """Complete scene.usdc and remove the chunks; without a frame no file is written. Raises OutputError.
