@@ -69,7 +69,9 @@ class ViewTrack:
         for prim, azimuth, elevation in aims:  # all look along their -z
             angles = (-elevation, azimuth, 0.0) if scene.up == "y" else (90.0 - elevation, 0.0, azimuth)
             prim.AddRotateXYZOp().Set(Gf.Vec3f(*angles))
-        UsdLux.DomeLight.Define(stage, f"{VIEW}/dome").CreateIntensityAttr(DOME)
+        dome = UsdLux.DomeLight.Define(stage, f"{VIEW}/dome")
+        dome.CreateIntensityAttr(DOME)
+        dome.CreateColorAttr(Gf.Vec3f(1.0))  # without it Blender keeps the dark grey of its world
 
     def _lamps(self) -> list[tuple[str, float, float, float, np.ndarray]]:
         """Return name, azimuth and elevation [deg], intensity and sRGB colour of each lamp."""
