@@ -80,7 +80,8 @@ def transferred(surface, vertices: np.ndarray, triangles: np.ndarray) -> tuple[n
     if surface.uvs is None and not surface.subsets:
         return None, {}
     with_area = np.flatnonzero(normals_and_heights(surface.vertices, surface.triangles)[1] > 0.0)
-    source = with_area[_nearest(surface, with_area, vertices[triangles].mean(axis=1))[1]]
+    nearest = lambda rows, points: nearest_points(surface.vertices, surface.triangles[rows], points)  # noqa: E731
+    source = with_area[nearest(with_area, vertices[triangles].mean(axis=1))[1]]
     subsets = subsets_of(surface.subsets, source)
     if surface.uvs is None:
         return None, subsets
@@ -88,15 +89,10 @@ def transferred(surface, vertices: np.ndarray, triangles: np.ndarray) -> tuple[n
     for one in np.unique(chart[source]):
         rows, own = np.flatnonzero(chart[source] == one), with_area[chart[with_area] == one]
         used, corner = np.unique(triangles[rows], return_inverse=True)
-        point, at = _nearest(surface, own, vertices[used])
+        point, at = nearest(own, vertices[used])
         weights = _barycentric(surface.vertices[surface.triangles[own[at]]], point)
         uvs[rows] = np.einsum("pk,pkx->px", weights, surface.uvs[own[at]])[corner.reshape(-1, 3)]
     return uvs, subsets
-
-
-def _nearest(surface, rows: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the points (p,3) [m] of triangles `rows` nearest to points (p,3), and the index in rows of each (p,)."""
-    return nearest_points(surface.vertices, surface.triangles[rows], points)
 
 
 def _barycentric(corners: np.ndarray, points: np.ndarray) -> np.ndarray:

@@ -30,15 +30,14 @@ from taisoft.mesh.usd_content import usd_message
 from taisoft.output.files import make_folder, output_errors
 from taisoft.output.nodal_fields import UNKNOWN_ERROR, NodalMean, von_mises
 from taisoft.output.usd_curves import TENSION
-from taisoft.output.usd_scene import CLIPPING, FOCAL, TRANSFORM, TRANSLATE, scene_layer
+from taisoft.output.usd_scene import OF_CAMERA, scene_layer
 from taisoft.output.usd_surface import ERROR, IMPULSE, NORMALS, ROOT, STRESS, VELOCITIES
 
 SCENE_NAME = "scene.usdc"
 CHUNKS_NAME = "chunks"
 SAME_FRAME = 1e-8  # relative error of a frame's time, from the rounding of dt and of its sum, that its time code does not show
 INSTANT = 0.01  # of a frame: the time over which the velocity of an obstacle on a path is a difference
-TIME_VARYING = {"points", "extent", VELOCITIES, NORMALS, STRESS, IMPULSE, ERROR, f"primvars:{TENSION}"}  # attributes
-TIME_VARYING |= {TRANSLATE, TRANSFORM, FOCAL, CLIPPING}  # of the camera
+TIME_VARYING = {"points", "extent", VELOCITIES, NORMALS, STRESS, IMPULSE, ERROR, f"primvars:{TENSION}", *OF_CAMERA}  # attributes
 
 
 class UsdWriter:
@@ -81,7 +80,7 @@ class UsdWriter:
 
     def _take_over(self, old: list[Path]) -> None:
         """Check the files of an earlier run, and take over what later frames depend on."""
-        eye = None
+        transform = None
         for path in old:
             layer = _opened(path)
             if layer.timeCodesPerSecond != self._template.timeCodesPerSecond or _structure(layer) != _structure(self._template):
@@ -93,10 +92,10 @@ class UsdWriter:
             self._earlier.append(path)
             times = {track: layer.ListTimeSamplesForPath(track.points) for track, _ in self._obstacles}
             self._moved |= {track for track, codes in times.items() if codes and codes[0] <= self._kept}
-            if codes := [code for code in layer.ListTimeSamplesForPath(self._view.attribute) if code <= self._kept]:
-                eye = layer.QueryTimeSample(self._view.attribute, codes[-1])
-        if eye is not None:
-            self._view.resume(np.array(eye))
+            if codes := [code for code in layer.ListTimeSamplesForPath(self._view.transform) if code <= self._kept]:
+                transform = layer.QueryTimeSample(self._view.transform, codes[-1])
+        if transform is not None:
+            self._view.resume(np.array(transform))
 
     def frame(self, sim, index: int) -> None:
         """Record sim's state as frame index, which must ascend; the first, if not 0, counts from time 0. Raises OutputError."""

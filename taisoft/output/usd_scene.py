@@ -17,14 +17,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from taisoft.mesh.placing import FROM_Y_UP
 from taisoft.output.appearance import body_colours, linear_rgb, obstacle_surfaces
 from taisoft.output.usd_curves import Curves
 from taisoft.output.usd_surface import ROOT, Track, define_body, define_obstacle, prim_names
 from taisoft.output.viewpoint import MAX_WIDENING, Viewpoint, camera_viewpoint, framed_points, start_positions
+from taisoft.scene.look import Light
 
 VIEW = "/View"
-TRANSLATE, TRANSFORM, FOCAL, CLIPPING = "xformOp:translate", "xformOp:transform", "focalLength", "clippingRange"  # of the camera
+OF_CAMERA = {"xformOp:transform", "focalLength", "clippingRange"}  # its attributes that change
 PICTURE = (16, 9)  # width and height
 SENSOR = 0.036  # width of the film back [m], as for 36 mm film
 HEIGHT = SENSOR * PICTURE[1] / PICTURE[0]  # of the film back [m]
@@ -34,78 +34,67 @@ LENS = 10.0  # USD gives aperture and focal length in tenths of the scene's unit
 
 
 class ViewTrack:
-    """Motion of the camera: `attribute` is the path of its translation or transform, `samples` gives its values in a frame.
+    """Motion of the camera: `samples` gives the values of its attributes in a frame; `transform` is the path of its transform.
 
-    Defines the prims of camera and lights on a stage. The scene's own camera has a transform, a focal length and clipping planes
-    in each frame, the other one only a translation.
+    Defines the prims of camera and lights on a stage.
     """
 
     def __init__(self, stage, scene):
         from pxr import Gf, UsdGeom, UsdLux
 
-        x = start_positions(scene)
-        self._scene, own = scene, camera_viewpoint(scene, 0.0, x)
-        self.camera = own or Viewpoint.framing(framed_points(scene), PICTURE, up=scene.up)
-        self._widest = MAX_WIDENING * self.camera.distance
+        self._scene, self._camera = scene, Viewpoint.framing(framed_points(scene), PICTURE, up=scene.up)
+        self._widest = MAX_WIDENING * self._camera.distance
         UsdGeom.Xform.Define(stage, VIEW)
         camera = UsdGeom.Camera.Define(stage, f"{VIEW}/camera")
         camera.CreateHorizontalApertureAttr(LENS * SENSOR)
         camera.CreateVerticalApertureAttr(LENS * HEIGHT)
-        camera.CreateFocalLengthAttr(LENS * HEIGHT / 2 / self.camera.slope)
-        near, far = self.camera.clipping
-        camera.CreateClippingRangeAttr(Gf.Vec2f(near, MAX_WIDENING * far))
-        self._path = camera.GetPath()
-        self.attribute = self._path.AppendProperty(TRANSFORM if own else TRANSLATE)
-        aims = [] if own else [(camera, self.camera.azimuth, self.camera.elevation)]
-        (camera.AddTransformOp if own else camera.AddTranslateOp)()
-        for path, value in self.samples(0.0, x):
-            stage.GetAttributeAtPath(path).Set(value)
-        for name, azimuth, elevation, intensity, colour in self._lamps():
-            lamp = UsdLux.DistantLight.Define(stage, f"{VIEW}/{name}")
-            lamp.CreateIntensityAttr(intensity)
-            lamp.CreateColorAttr(Gf.Vec3f(*linear_rgb(colour).tolist()))
-            lamp.CreateNormalizeAttr(True)
-            aims.append((lamp, azimuth, elevation))
-        for prim, azimuth, elevation in aims:  # all look along their -z
-            angles = (-elevation, azimuth, 0.0) if scene.up == "y" else (90.0 - elevation, 0.0, azimuth)
-            prim.AddRotateXYZOp().Set(Gf.Vec3f(*angles))
+        attributes = camera.AddTransformOp().GetAttr(), camera.CreateFocalLengthAttr(), camera.CreateClippingRangeAttr()
+        self._paths = [attribute.GetPath() for attribute in attributes]
+        self.transform = self._paths[0]
+        for attribute, (_, value) in zip(attributes, self.samples(0.0, start_positions(scene))):
+            attribute.Set(value)
+        lamp = Viewpoint(azimuth=self._camera.azimuth + LAMP_TURN, elevation=LAMP_ELEVATION, up=scene.up)
+        lights = (Light(lamp.forward, LAMP / math.pi),) if scene.lights is None else scene.lights
+        for name, light in zip(prim_names(["lamp"] * len(lights)), lights):
+            prim = UsdLux.DistantLight.Define(stage, f"{VIEW}/{name}")
+            prim.CreateIntensityAttr(math.pi * light.strength)
+            prim.CreateColorAttr(Gf.Vec3f(*linear_rgb(light.colour).tolist()))
+            prim.CreateNormalizeAttr(True)
+            turn = Gf.Rotation(Gf.Vec3d(0.0, 0.0, -1.0), Gf.Vec3d(*light.direction.tolist()))  # it shines along its -z
+            prim.AddOrientOp().Set(Gf.Quatf(turn.GetQuat()))
         dome = UsdLux.DomeLight.Define(stage, f"{VIEW}/dome")
         dome.CreateIntensityAttr(DOME)
         dome.CreateColorAttr(Gf.Vec3f(1.0))  # without it Blender keeps the dark grey of its world
 
-    def _lamps(self) -> list[tuple[str, float, float, float, np.ndarray]]:
-        """Return name, azimuth and elevation [deg], intensity and sRGB colour of each lamp."""
-        if self._scene.lights is None:
-            return [("lamp", self.camera.azimuth + LAMP_TURN, LAMP_ELEVATION, LAMP, np.ones(3))]
-        found = []
-        for k, light in enumerate(self._scene.lights):
-            x, y, z = -light.direction @ FROM_Y_UP[self._scene.up]
-            angles = math.degrees(math.atan2(x, z)), math.degrees(math.atan2(y, math.hypot(x, z)))
-            found.append((f"light_{k}", *angles, math.pi * light.strength, light.colour))
-        return found
+    @property
+    def eye(self) -> np.ndarray:
+        """Position of the camera (3,) [m]."""
+        return self._camera.position
 
-    def resume(self, value: np.ndarray) -> None:
-        """Start from the last value of `attribute`: the position (3,) [m] of a camera that steps back."""
-        if self._scene.camera is None:
-            self._set_distance(float(np.linalg.norm(value - self.camera.target)))
+    def resume(self, transform: np.ndarray) -> None:
+        """Start from the camera's last transform (4,4)."""
+        self._set_distance(float(np.linalg.norm(transform[3, :3] - self._camera.target)))
 
     def samples(self, t: float, x: np.ndarray) -> list[tuple]:
-        """Return (path, value) of each attribute at time t [s], with nodes at x (n,3) [m]; a camera moves back to see them."""
+        """Return (path, value) of each attribute at time t [s], with nodes at x (n,3) [m].
+
+        The scene's own camera is where it is at that time, another one moves back until it sees the nodes.
+        """
         from pxr import Gf
 
         if self._scene.camera is None:
-            self._set_distance(self.camera.widened(x, PICTURE, self._widest).distance)
-            return [(self.attribute, Gf.Vec3d(*self.camera.position.tolist()))]
-        self.camera = camera_viewpoint(self._scene, t, x)
-        right, up, forward = self.camera.axes
+            self._set_distance(self._camera.widened(x, PICTURE, self._widest).distance)
+        else:
+            self._camera = camera_viewpoint(self._scene, t, x)
+        right, up, forward = self._camera.axes
         transform = np.eye(4)
-        transform[:, :3] = right, up, -forward, self.camera.position
-        values = Gf.Matrix4d(transform.tolist()), LENS * HEIGHT / 2 / self.camera.slope, Gf.Vec2f(*self.camera.clipping)
-        return [(self._path.AppendProperty(name), value) for name, value in zip((TRANSFORM, FOCAL, CLIPPING), values)]
+        transform[:, :3] = right, up, -forward, self.eye
+        lens = LENS * HEIGHT / 2 / self._camera.slope
+        return list(zip(self._paths, (Gf.Matrix4d(transform.tolist()), lens, Gf.Vec2f(*self._camera.clipping))))
 
     def _set_distance(self, distance: float) -> None:
         """Set the distance [m], rounded so that a resumed run computes the same one from the position that it reads."""
-        self.camera = replace(self.camera, distance=float(f"{distance:.12g}"))
+        self._camera = replace(self._camera, distance=float(f"{distance:.12g}"))
 
 
 def scene_layer(scene, fps: float, touching: bool, errors: bool) -> tuple[list[Track], list, Curves | None, ViewTrack, object]:
@@ -134,6 +123,6 @@ def scene_layer(scene, fps: float, touching: bool, errors: bool) -> tuple[list[T
     view = ViewTrack(stage, scene)
     n_bodies, n_colliders = len(scene.bodies), len(scene.colliders)
     surfaces = [s for s in zip(obstacle_surfaces(scene), legal[n_bodies:n_colliders]) if len(s[0].triangles)]
-    obstacles = [(define_obstacle(stage, surface, name, view.camera.position), surface) for surface, name in surfaces]
+    obstacles = [(define_obstacle(stage, surface, name, view.eye), surface) for surface, name in surfaces]
     curves = Curves(stage, ROOT, scene, legal[n_colliders:]) if scene.springs or scene.tendons else None
     return tracks, obstacles, curves, view, layer
