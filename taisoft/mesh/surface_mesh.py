@@ -174,11 +174,11 @@ def read_surface(path, weld: float = 0.0) -> SurfaceMesh:
     if uvs is not None:
         uvs = _fans(uvs, np.empty((0, 3, 2)))
         missing = np.isnan(uvs).any(axis=(1, 2))
+        uvs[missing] = 0.0
         if missing.any():
-            notes.append(
+            notes = [
                 f"{missing.sum()} triangles have no texture coordinates, and get 0, the first is triangle {missing.argmax()}"
-            )
-            uvs[missing] = 0.0
+            ]
     parents = np.repeat(np.arange(len(polygons)), [nodes.shape[0] * (nodes.shape[1] - 2) for nodes in polygons])
     return clean_surface(SurfaceMesh(points, triangles, name, notes, uvs, subsets_of(subsets, parents)), weld)
 

@@ -21,8 +21,7 @@ def checked_uvs(uvs, n: int, error: Callable[[str], MeshError]) -> np.ndarray | 
     array = np.array(uvs)
     if array.shape != (n, 3, 2) or array.dtype.kind not in "fiu":
         raise error(f"uvs must be numbers of shape ({n}, 3, 2), two for each corner, not {array.dtype} of shape {array.shape}")
-    bad = np.argwhere(~np.isfinite(array))
-    if len(bad):
+    if len(bad := np.argwhere(~np.isfinite(array))):
         raise error(f"uvs of triangle {bad[0, 0]}, corner {bad[0, 1]} are not finite")
     array = array.astype(np.float64)
     array.setflags(write=False)
@@ -33,12 +32,10 @@ def checked_subsets(subsets, n: int, error: Callable[[str], MeshError]) -> dict[
     """Return subsets of n triangles, ascending and read-only. error: makes an error of its text."""
     taken, found = np.zeros(n, dtype=bool), {}
     for name, given in dict(subsets or {}).items():
-        if not isinstance(name, str) or not name:
-            raise error(f"a subset's name must be text, not {value_text(name)}")
-        ids = np.unique(np.asarray(given))
-        if np.ndim(given) != 1 or (len(ids) and ids.dtype.kind not in "iu"):
-            raise error(f"subset {name!r} must be triangles' numbers, not {value_text(given)}")
-        ids = ids.astype(np.int64)
+        ids = np.asarray(given)
+        if not isinstance(name, str) or not name or ids.ndim != 1 or (len(ids) and ids.dtype.kind not in "iu"):
+            raise error(f"subset {name!r} must be a name and numbers of triangles, not {value_text(given)}")
+        ids = np.unique(ids).astype(np.int64)
         if len(ids) and not 0 <= ids[0] <= ids[-1] < n:
             raise error(f"subset {name!r}: triangle {ids[0] if ids[0] < 0 else ids[-1]} does not exist ({n} triangles)")
         if taken[ids].any():
@@ -62,13 +59,12 @@ def split_uvs(uvs: np.ndarray) -> np.ndarray:
 
 
 def charts(triangles: np.ndarray, uvs: np.ndarray) -> np.ndarray:
-    """Return the chart (t,) of each triangle (t,3) with UVs (t,3,2), from 0."""
+    """Return the chart (t,) of each triangle (t,3) with UVs (t,3,2)."""
     corner = np.unique(np.column_stack([triangles.reshape(-1), uvs.reshape(-1, 2)]), axis=0, return_inverse=True)[1]
     ends = np.sort(corner.reshape(-1, 3)[:, HALF_EDGES].reshape(-1, 2), axis=1)
     edges, edge = np.unique(ends, axis=0, return_inverse=True)
     t = len(triangles)
-    label = linked_groups(np.repeat(np.arange(t), 3), t + edge.ravel(), t + len(edges))[1][:t]
-    return np.unique(label, return_inverse=True)[1]
+    return linked_groups(np.repeat(np.arange(t), 3), t + edge.ravel(), t + len(edges))[1][:t]
 
 
 def transferred(surface, vertices: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray | None, dict[str, np.ndarray]]:
@@ -97,9 +93,7 @@ def transferred(surface, vertices: np.ndarray, triangles: np.ndarray) -> tuple[n
 
 def _barycentric(corners: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Return the barycentric coordinates (p,3) of points (p,3) in triangles (p,3,3)."""
-    b, c, x = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0], points - corners[:, 0]
-    normal = np.cross(b, c)
-    squared = np.einsum("px,px->p", normal, normal)
-    u, v = (np.einsum("px,px->p", np.cross(*pair), normal) / squared for pair in ((x, c), (b, x)))
+    edges = corners[:, 1:] - corners[:, :1]
+    u, v = np.einsum("pxk,px->kp", np.linalg.pinv(edges), points - corners[:, 0])
     weights = np.clip(np.stack([1.0 - u - v, u, v], axis=1), 0.0, 1.0)
     return weights / weights.sum(axis=1, keepdims=True)

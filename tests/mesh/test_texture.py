@@ -165,8 +165,8 @@ def test_second_order_faces_are_split():
         ({"subsets": {"a": [0, len(T)]}}, rf"subset 'a': triangle {len(T)} does not exist \({len(T)} triangles\)"),
         ({"subsets": {"a": [-1]}}, "subset 'a': triangle -1 does not exist"),
         ({"subsets": {"a": [0, 1], "b": [1]}}, "subset 'b': triangle 1 is in another subset too"),
-        ({"subsets": {"a": [0.5]}}, "subset 'a' must be triangles' numbers"),
-        ({"subsets": {1: [0]}}, "a subset's name must be text, not 1"),
+        ({"subsets": {"a": [0.5]}}, "subset 'a' must be a name and numbers of triangles"),
+        ({"subsets": {1: [0]}}, "subset 1 must be a name and numbers of triangles"),
     ],
 )
 def test_what_does_not_fit_is_refused(more, message):
