@@ -1,7 +1,7 @@
 """Texture coordinates and subsets of triangle surfaces: how they are checked, cut, and passed on to another surface.
 
-Texture coordinates (UVs) belong to the corners of triangles, so a vertex on a seam has several. Triangles that meet at an edge
-with the same UVs at both its ends are in one chart. Subsets are named sets of triangles, such as those of one material; no
+Texture coordinates (UVs) belong to the corners of triangles, so a vertex on a seam has several. Triangles are connected if they
+meet at an edge with the same UVs at both its ends. Subsets are named sets of triangles, such as those of one material; no
 triangle is in two.
 """
 
@@ -10,8 +10,10 @@ from collections.abc import Callable
 import numpy as np
 
 from taisoft.errors import MeshError, value_text
-from taisoft.mesh.sdf import nearest_points
+from taisoft.mesh.sdf import Triangles
 from taisoft.mesh.topology import HALF_EDGES, linked_groups, normals_and_heights
+
+CHUNK = 128  # triangles that get UVs at once, each with some hundred triangles of the source near it
 
 
 def checked_uvs(uvs, n: int, error: Callable[[str], MeshError]) -> np.ndarray | None:
@@ -58,37 +60,51 @@ def split_uvs(uvs: np.ndarray) -> np.ndarray:
     return np.stack([a, ab, ca, ab, b, bc, ca, bc, c, ab, bc, ca], axis=1).reshape(-1, 3, 2)
 
 
-def charts(triangles: np.ndarray, uvs: np.ndarray) -> np.ndarray:
-    """Return the chart (t,) of each triangle (t,3) with UVs (t,3,2)."""
-    corner = np.unique(np.column_stack([triangles.reshape(-1), uvs.reshape(-1, 2)]), axis=0, return_inverse=True)[1]
-    ends = np.sort(corner.reshape(-1, 3)[:, HALF_EDGES].reshape(-1, 2), axis=1)
-    edges, edge = np.unique(ends, axis=0, return_inverse=True)
-    t = len(triangles)
-    return linked_groups(np.repeat(np.arange(t), 3), t + edge.ravel(), t + len(edges))[1][:t]
-
-
 def transferred(surface, vertices: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray | None, dict[str, np.ndarray]]:
     """Return UVs (t,3,2), or None, and subsets of triangles (t,3) near a `SurfaceMesh`.
 
-    vertices: (n,3) [m]. A triangle gets the subset and the chart of the triangle nearest to its centroid. Its corners get the
-    UVs of the nearest points of that chart, so it is not stretched across a seam: where it crosses one, it ends at the seam.
+    vertices: (n,3) [m]. A triangle gets the subset of the source's triangle nearest to its centroid. Its corners get the UVs at
+    the nearest points of those that are connected with that one nearby: where it crosses a seam, it ends at the seam.
     """
     if surface.uvs is None and not surface.subsets:
         return None, {}
-    with_area = np.flatnonzero(normals_and_heights(surface.vertices, surface.triangles)[1] > 0.0)
-    nearest = lambda rows, points: nearest_points(surface.vertices, surface.triangles[rows], points)  # noqa: E731
-    source = with_area[nearest(with_area, vertices[triangles].mean(axis=1))[1]]
-    subsets = subsets_of(surface.subsets, source)
-    if surface.uvs is None:
-        return None, subsets
-    chart, uvs = charts(surface.triangles, surface.uvs), np.empty((len(triangles), 3, 2))
-    for one in np.unique(chart[source]):
-        rows, own = np.flatnonzero(chart[source] == one), with_area[chart[with_area] == one]
-        used, corner = np.unique(triangles[rows], return_inverse=True)
-        point, at = nearest(own, vertices[used])
-        weights = _barycentric(surface.vertices[surface.triangles[own[at]]], point)
-        uvs[rows] = np.einsum("pk,pkx->px", weights, surface.uvs[own[at]])[corner.reshape(-1, 3)]
-    return uvs, subsets
+    rows = np.flatnonzero(normals_and_heights(surface.vertices, surface.triangles)[1] > 0.0)
+    source = Triangles(surface.vertices, surface.triangles[rows])
+    given = np.zeros((len(rows), 3, 2)) if surface.uvs is None else surface.uvs[rows]
+    edges, nearest, uvs = (
+        _uv_edges(source.triangles, given),
+        np.empty(len(triangles), dtype=np.int64),
+        np.empty((len(triangles), 3, 2)),
+    )
+    for first in range(0, len(triangles), CHUNK):
+        at = slice(first, first + CHUNK)
+        nearest[at], points, found = _located(source, edges, vertices[triangles[at]])
+        uvs[at] = np.einsum("pk,pkx->px", _barycentric(source.corners[found], points), given[found]).reshape(-1, 3, 2)
+    return None if surface.uvs is None else uvs, subsets_of(surface.subsets, rows[nearest])
+
+
+def _uv_edges(triangles: np.ndarray, uvs: np.ndarray) -> np.ndarray:
+    """Return numbers (t,3) of the edges of triangles (t,3); connected ones have the same number. uvs: (t,3,2)."""
+    corner = np.unique(np.column_stack([triangles.reshape(-1), uvs.reshape(-1, 2)]), axis=0, return_inverse=True)[1]
+    ends = np.sort(corner.reshape(-1, 3)[:, HALF_EDGES].reshape(-1, 2), axis=1)
+    return np.unique(ends, axis=0, return_inverse=True)[1].reshape(-1, 3)
+
+
+def _located(source: Triangles, edges: np.ndarray, corners: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the triangles (k,) of a source nearest to centroids; nearest points (3k,3) [m] to corners (k,3,3) of triangles that
+    edges (t,3) connect nearby with those; and their triangles (3k,)."""
+    k, middle = len(corners), corners.mean(axis=1)
+    nearest = source.closest(middle)[1]
+    apart = np.linalg.norm(source.closest(corners.reshape(-1, 3))[0].reshape(corners.shape) - corners, axis=2)
+    owner, near = source.balls.pairs(middle, (np.linalg.norm(corners - middle[:, None], axis=2) + apart).max(axis=1))
+    numbers, n = np.unique(owner[:, None] * (edges.max() + 1) + edges[near], return_inverse=True)[1], len(owner)
+    part = linked_groups(np.repeat(np.arange(n), 3), n + numbers.ravel(), n + numbers.max() + 1)[1][:n]
+    first = near == nearest[owner]
+    own_part = np.empty(k, dtype=np.int64)
+    own_part[owner[first]] = part[first]
+    owner, near = (one[part == own_part[owner]] for one in (owner, near))
+    pairs = (3 * owner[:, None] + np.arange(3)).ravel(), np.repeat(near, 3)
+    return nearest, *source.closest_of(corners.reshape(-1, 3), *pairs)
 
 
 def _barycentric(corners: np.ndarray, points: np.ndarray) -> np.ndarray:

@@ -10,7 +10,7 @@ import pytest
 import taisoft as ts
 from taisoft.errors import MeshError
 from taisoft.mesh.nodes import make_nodes
-from taisoft.mesh.texture import charts, split_uvs, transferred
+from taisoft.mesh.texture import split_uvs, transferred
 
 BALL = ts.ball_mesh(0.5, 4)
 USED, CORNERS = np.unique(BALL.surface, return_inverse=True)
@@ -111,11 +111,31 @@ def test_they_survive_welding_cleaning_and_placing(tmp_path, seed):
         assert np.array_equal(one.subsets["left"], np.flatnonzero(~right))
 
 
-def test_charts_end_where_uvs_jump():
-    surface, side = box_surface((2, 2, 2))
-    chart = charts(surface.triangles, surface.uvs)
-    assert len(set(chart)) == 6 == len(set(zip(chart.tolist(), side.tolist())))
-    assert len(set(charts(surface.triangles, np.zeros_like(surface.uvs)))) == 1
+def tube(around=40, along=8):
+    """A tube about y whose u runs once around it, and so meets itself in a seam; v is the height."""
+    u, v = np.meshgrid(np.arange(around + 1) / around, np.arange(along + 1) / along, indexing="ij")
+    number = (np.arange(around + 1) % around)[:, None] * (along + 1) + np.arange(along + 1)
+    quads = [(i, j) for i in range(around) for j in range(along)]
+    loops = np.array([[(i, j), (i, j + 1), (i + 1, j + 1), (i + 1, j)] for i, j in quads])[:, [[0, 1, 2], [0, 2, 3]]].reshape(
+        -1, 3, 2
+    )
+    corner = tuple(np.moveaxis(loops, -1, 0))
+    x = np.stack([np.cos(2 * np.pi * u), v, np.sin(2 * np.pi * u)], axis=-1)[:-1].reshape(-1, 3)
+    return ts.SurfaceMesh(x, number[corner], uvs=np.stack([u[corner], v[corner]], axis=-1))
+
+
+@pytest.mark.parametrize("around, along", [(13, 3), (90, 20)])
+def test_no_triangle_shows_both_sides_of_a_seam(around, along):
+    """A coarser and a finer tube, turned by half a triangle, whose triangles cross the seam of the first."""
+    other = tube(around, along)
+    turn = np.pi / around
+    x = other.vertices @ np.array([(np.cos(turn), 0, np.sin(turn)), (0, 1, 0), (-np.sin(turn), 0, np.cos(turn))])
+    uvs, _ = transferred(tube(), x, other.triangles)
+    assert np.ptp(uvs[..., 0], axis=1).max() < 1.01 / around
+    expected = np.arctan2(x[:, 2], x[:, 0])[other.triangles] / (2 * np.pi) % 1.0
+    inside = np.ptp(expected, axis=1) < 0.5  # those that do not cross
+    assert inside.sum() == 2 * along * (around - 1)
+    assert np.abs(uvs[inside][..., 0] - expected[inside]).max() < 0.002 and np.allclose(uvs[..., 1], x[other.triangles][..., 1])
 
 
 def test_another_surface_gets_them_chart_by_chart():
