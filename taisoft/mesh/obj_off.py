@@ -23,9 +23,10 @@ def read_obj(name: str, data: bytes) -> tuple[np.ndarray, list[np.ndarray], list
 
     UVs are NaN at polygons without any, and None if none has some. Subsets are those of `usemtl`, else of `g`, else of `o`.
     """
-    points, polygons, texture, textured = [], [], [], []  # textured: line, UVs so far and numbers of UVs of each polygon
+    lines = content_lines(name, data)
+    points, polygons, texture, rows, n = [], [], [], [], sum(words[0] == "vt" for _, words in lines)  # rows of texture; n: none
     current, members = dict.fromkeys(("usemtl", "g", "o"), ""), {"usemtl": {}, "g": {}, "o": {}}
-    for number, words in content_lines(name, data):
+    for number, words in lines:
         try:
             if words[0] == "v":
                 x, y, z = words[1:4]
@@ -36,38 +37,29 @@ def read_obj(name: str, data: bytes) -> tuple[np.ndarray, list[np.ndarray], list
             elif words[0] in current:
                 current[words[0]] = " ".join(words[1:])
             elif words[0] == "f":
-                corners, *rest = zip(*(_corner(word) for word in words[1:]), strict=True)
-                given = [k for ks in (corners, *rest) for k in ks]
-                if len(corners) < 3 or 0 in given or max(map(abs, given)) > len(data):
+                corners, *of_texture = zip(*(_corner(word) for word in words[1:]), strict=True)
+                if len(corners) < 3 or 0 in corners or max(map(abs, corners)) > len(data):
                     raise ValueError
+                for k in of_texture[0] if of_texture else ():
+                    if not -len(texture) <= k <= n or k == 0:
+                        raise MeshError(f"{name}: line {number}: vt {k} does not exist ({n} are given)")
                 for kind, called in current.items():
                     if called:
                         members[kind].setdefault(called, []).append(len(polygons))
                 polygons.append(np.array([[k - 1 if k > 0 else len(points) + k for k in corners]]))
-                textured.append((number, len(texture), rest[0] if rest else ()))
+                given = of_texture[0] if of_texture else (n + 1,) * len(corners)
+                rows.append(np.array([[k - 1 if k > 0 else len(texture) + k for k in given]]))
         except ValueError:
             raise MeshError(f"{name}: line {number}: expected {RULES[words[0]]}, not {one_line(' '.join(words))!r}") from None
-    uvs = _uvs_of(name, texture, textured, polygons) if any(ks for *_, ks in textured) else None
-    subsets = next((of for of in members.values() if of), {})
-    return np.array(points, dtype=np.float64).reshape(-1, 3), polygons, uvs, subsets
+    table = np.array([*texture, (np.nan, np.nan)])
+    uvs = [table[one] for one in rows] if any(one.min() < n for one in rows) else None
+    return np.array(points, dtype=np.float64).reshape(-1, 3), polygons, uvs, next((of for of in members.values() if of), {})
 
 
 def _corner(word: str) -> tuple[int, ...]:
     """Return the numbers of a corner's v and, if it is given, its vt."""
     position, *texture = word.split("/")[:2]
     return (to_int(position), *(to_int(k) for k in texture if k))
-
-
-def _uvs_of(name: str, texture: list, textured: list, polygons: list[np.ndarray]) -> list[np.ndarray]:
-    """Return the UVs of polygons, see `read_obj`."""
-    found, rows = [], np.array(texture).reshape(-1, 2)
-    for (number, so_far, ks), nodes in zip(textured, polygons):
-        at = [k - 1 if k > 0 else so_far + k for k in ks]
-        for k, row in zip(ks, at):
-            if not 0 <= row < len(rows):
-                raise MeshError(f"{name}: line {number}: vt {k} does not exist ({len(rows)} are given)")
-        found.append(rows[at][None] if at else np.full((*nodes.shape, 2), np.nan))
-    return found
 
 
 def read_off(name: str, data: bytes) -> tuple[np.ndarray, list[np.ndarray]]:

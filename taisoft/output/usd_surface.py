@@ -50,16 +50,14 @@ class Track:
     """
 
     def __init__(self, gprim, nodes=slice(None), fields: tuple[str, ...] = (), weights=None, rest=None, triangles=None):
+        from pxr import Sdf, UsdGeom, Vt
+
         self._nodes, self._weights, self._corners = nodes, weights, triangles
         self.points, self._extent = gprim.GetPointsAttr().GetPath(), gprim.GetExtentAttr().GetPath()
         self._fields = [(name, gprim.GetPath().AppendProperty(name)) for name in fields]
-        if triangles is not None:
-            self._normals = gprim.GetPath().AppendProperty(NORMALS)
-            self._define_normals(gprim, rest, triangles)
-
-    def _define_normals(self, gprim, rest: np.ndarray, triangles: np.ndarray) -> None:
-        from pxr import Sdf, UsdGeom, Vt
-
+        if triangles is None:
+            return
+        self._normals = gprim.GetPath().AppendProperty(NORMALS)
         self._split, self._corners = smoothing_groups(rest, triangles)
         smooth = len(self._split) == len(rest)
         if smooth:
