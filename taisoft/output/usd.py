@@ -13,9 +13,9 @@ the linear triangles and tets that its elements are cut into, with all its nodes
 Both carry `primvars:vonMisesStress` [Pa]. If there can be contacts, the surface also carries `primvars:contactImpulse` [N s], the
 impulse of the last step before the frame on each point. `nodal_fields.py` defines both. A run with error=True adds
 `primvars:estimatedError` [m], `Simulator.nodal_errors`, -1 where unknown.
-An obstacle is `/World/<name>` with `surface` and `material`; its points change over time if it follows a path. A half-space
-whose square lies entirely within others is left out. A spring or a tendon is `/World/<name>`, see `usd_curves.py`. `/View` holds
-a camera and lights (`usd_scene.py`).
+Surfaces have normals and velocities (`usd_surface.py`). An obstacle is `/World/<name>` with `surface` and `material`; its points
+change over time if it follows a path. A half-space whose square lies entirely within others is left out. A spring or a tendon is
+`/World/<name>`, see `usd_curves.py`. `/View` holds a camera and lights (`usd_scene.py`).
 """
 
 import math

@@ -6,10 +6,11 @@ culling, half-spaces that face away from the camera at the start, and so hide th
 only on request. Open obstacle meshes are double-sided.
 
 `/View` is outside of the default prim. So a reference to the scene gets the bodies alone, and the names of bodies and lights
-cannot clash. The camera is that of the pictures: it frames the bodies at the start and moves back to keep them in view. The lamp
-shines over the viewer's left shoulder; from there upright walls along the axes that face the camera cast no shadow into a bin.
-The dome is uniformly grey. Intensities suit an exposure of 1 (a white face perpendicular to the lamp renders nearly white). The
-lamp is normalized: readers that ignore this attribute take the intensity as irradiance [W/m^2], which is then the same.
+cannot clash. Camera and lights are those of the scene. Else the camera is that of the pictures: it frames the bodies at the start
+and moves back to keep them in view. Else one lamp shines over the viewer's left shoulder; from there upright walls along the axes
+that face the camera cast no shadow into a bin. The dome is uniformly white. Intensities suit an exposure of 1 (a white face
+perpendicular to the lamp renders nearly white). Lamps are normalized: readers that ignore this attribute take the intensity as
+irradiance [W/m^2], which is then the same. Weak: Blender takes four times as much.
 """
 
 import math
