@@ -36,6 +36,7 @@ def draw(arguments: Namespace) -> int:
         with closing(OutputFolder(out, arguments.overwrite)) as folder:
             signals.run_began()
             writer = picture_writer(folder.path, run.scene, replace(options, bar=has_bar(options.colour)))
+            writer.renderer.colouring.fix(map(run.state, run.frames))
             drawn = 0
             with closing(writer):
                 for index in run.frames:

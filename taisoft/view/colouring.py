@@ -12,6 +12,7 @@ strength * its colour * max(0, -direction . n).
 """
 
 import math
+from collections.abc import Iterable
 
 import numpy as np
 
@@ -64,7 +65,7 @@ class Colouring:
     def choose(self, kind: str) -> None:
         """Colour by another quantity, with a scale of its own."""
         self.kind = checked_colour(kind)
-        self._peak = self.span = 0.0
+        self._peak, self.span, self._is_fixed = 0.0, 0.0, False
 
     @property
     def scale(self) -> tuple[str, float, float]:
@@ -75,6 +76,17 @@ class Colouring:
         """Continue the `scale` of an earlier run, unless it was of another quantity."""
         if kind == self.kind:
             self._peak, self.span = float(peak), float(span)
+
+    def fix(self, states: Iterable[DrawnState]) -> None:
+        """Keep one scale from now on, that of the largest values in these states."""
+        if self.kind != "body":
+            self.span, self._is_fixed = round_up(max(MIN_SPAN[self.kind], *map(self._largest, states))), True
+
+    def _largest(self, state: DrawnState) -> float:
+        """Return the quantile of a state's values above the scale's lower end."""
+        above = state.values[self.kind].astype(np.float64) - self.low
+        finite = above[np.isfinite(above) & ((above > 0.0) | (self.kind not in POSITIVE))]
+        return float(np.quantile(finite, QUANTILE)) if len(finite) else 0.0
 
     def choose_next(self) -> None:
         """Colour by the next of UNITS; by the error only if that was the first choice, since it needs a run with error=True."""
@@ -90,10 +102,8 @@ class Colouring:
         if self.kind not in state.values:
             return self._surfaces.colours
         above = state.values[self.kind].astype(np.float64) - self.low
-        finite = above[np.isfinite(above) & ((above > 0.0) | (self.kind not in POSITIVE))]
-        value = float(np.quantile(finite, QUANTILE)) if len(finite) else 0.0
-        self._peak = max(value, DECAY * self._peak, MIN_SPAN[self.kind])
-        if self._peak > self.span or round_up(LOWER_MARGIN * self._peak) < self.span:
+        self._peak = max(self._largest(state), DECAY * self._peak, MIN_SPAN[self.kind])
+        if not self._is_fixed and (self._peak > self.span or round_up(LOWER_MARGIN * self._peak) < self.span):
             self.span = round_up(self._peak)
         colours = colours_of(np.nan_to_num(above / self.span))
         colours[np.isnan(above)] = UNKNOWN
