@@ -74,7 +74,8 @@ class ViewTrack:
 
     def resume(self, transform: np.ndarray) -> None:
         """Start from the camera's last transform (4,4)."""
-        self._set_distance(float(np.linalg.norm(transform[3, :3] - self._camera.target)))
+        right, up, back = self._camera.axes @ (transform[3, :3] - self._camera.target)
+        self._move(self._camera.target + (right, up) @ self._camera.axes[:2], -back)
 
     def samples(self, t: float, x: np.ndarray) -> list[tuple]:
         """Return (path, value) of each attribute at time t [s], with nodes at x (n,3) [m].
@@ -84,7 +85,8 @@ class ViewTrack:
         from pxr import Gf
 
         if self._scene.camera is None:
-            self._set_distance(self._camera.widened(x, PICTURE, self._widest).distance)
+            moved = self._camera.widened(x, PICTURE, self._widest)
+            self._move(moved.target, moved.distance)
         else:
             self._camera = camera_viewpoint(self._scene, t, x)
         right, up, forward = self._camera.axes
@@ -93,9 +95,10 @@ class ViewTrack:
         lens = LENS * HEIGHT / 2 / self._camera.slope
         return list(zip(self._paths, (Gf.Matrix4d(transform.tolist()), lens, Gf.Vec2f(*self._camera.clipping))))
 
-    def _set_distance(self, distance: float) -> None:
-        """Set the distance [m], rounded so that a resumed run computes the same one from the position that it reads."""
-        self._camera = replace(self._camera, distance=float(f"{distance:.12g}"))
+    def _move(self, target: np.ndarray, distance: float) -> None:
+        """Set target and distance [m], rounded so that a resumed run computes the same ones from the position that it reads."""
+        unit = 1e-12 * self._widest
+        self._camera = replace(self._camera, target=unit * np.round(target / unit), distance=unit * round(distance / unit))
 
 
 def scene_layer(scene, fps: float, touching: bool, errors: bool) -> tuple[list[Track], list, Curves | None, ViewTrack, object]:

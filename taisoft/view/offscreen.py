@@ -60,7 +60,7 @@ class Offscreen(SceneView):
         self._before: dict = {}  # what was kept before it
 
     def kept(self, time: float | None = None) -> dict:
-        """Return, as plain data, what pictures from time [s] on depend on: distance of the camera [m], scales, recent maxima.
+        """Return, as plain data, what pictures from time [s] on depend on: camera, scales, recent maxima.
 
         A picture already drawn at that time does not count, since a resumed run draws it again; without a time all do.
         """
@@ -69,7 +69,8 @@ class Offscreen(SceneView):
     def resume(self, kept: dict) -> None:
         """Continue from what an earlier run kept; entries that are missing start anew."""
         if kept.get("camera") is not None:
-            self.camera = replace(self.camera, distance=float(kept["camera"]))
+            *target, distance = kept["camera"]
+            self.camera = replace(self.camera, target=np.array(target), distance=distance)
         self.colouring.resume(*kept.get("scale", self.colouring.scale))
         self.layers.peak = float(kept.get("impulse", 0.0))
         self.layers.connections.peak = float(kept.get("tension", 0.0))
@@ -78,7 +79,7 @@ class Offscreen(SceneView):
     def _present(self) -> dict:
         layers = self.layers
         peaks = {"impulse": layers.peak, "tension": layers.connections.peak, "pressure": layers.pressures.peak}
-        return {"camera": self.camera.distance, "scale": list(self.colouring.scale)} | peaks
+        return {"camera": [*self.camera.target.tolist(), self.camera.distance], "scale": list(self.colouring.scale)} | peaks
 
     def image(self, sim) -> np.ndarray:
         """Return a picture of a `DrawnState`, or of a simulator's present state, uint8 (height, width, 3), first row on top.
