@@ -143,8 +143,7 @@ def test_a_camera_with_z_up_is_one_with_y_up_turned():
 def test_camera_moves_back_from_approaching_bodies():
     camera = Viewpoint(target=np.zeros(3), distance=10.0, azimuth=0.0, elevation=0.0, fov=90.0)
     near = np.array([[0.0, 1, 0], [2, 0, 0]])
-    size, border = (200, 100), camera._slopes(WHOLE, (200, 100), 1.0)[1] / camera._slopes(WHOLE, (200, 100), 1.0 - BORDER)[1]
-    edge = 1.0 / border[1]  # of what is seen, over the depth
+    size, edge = (200, 100), 1.0 - BORDER  # of what must be seen, over the depth
     assert camera.widened(near, size, 100.0) == camera
     corners = 10.0 * edge * np.array([[-2.0, -1, 0], [2, -1, 0], [-2, 1, 0], [2, 1, 0]])
     for far, distance in (
