@@ -10,7 +10,7 @@ from importlib.util import find_spec
 import numpy as np
 
 from taisoft.errors import OutputError
-from taisoft.view.colouring import TITLES, UNITS, Colouring, colours_of, round_up
+from taisoft.view.colouring import TITLES, Colouring, colours_of, round_up
 from taisoft.view.drawn import DrawnState
 from taisoft.view.plots import Plot, PlotChoice, series_of
 
@@ -46,8 +46,8 @@ class Annotations:
         """Return an annotated copy of a picture, uint8 (height, width, 3), of a state; index: frame number."""
         height, width = picture.shape[:2]
         self._clear((width, height))
-        if self._plots is not None and (names := self._plots.visible()):
-            self._draw_plots(names, width * HEIGHT / height - MARGIN)
+        if self._plots is not None and (plots := self._plots.visible()):
+            self._draw_plots(plots, width * HEIGHT / height - MARGIN)
         bottom = MARGIN  # of what comes next
         if self._name is not None:
             text = "   ".join(f"{name} {energy:.4g} J" for name, energy in state.energies.items())
@@ -93,19 +93,18 @@ class Annotations:
         colours, place = colours_of(np.linspace(0.0, 1.0, width)), (MARGIN, MARGIN + width, bottom, bottom + height)
         self._axes.imshow(colours[None], aspect="auto", extent=place, zorder=2)
         self._write((MARGIN, bottom + height + 4), TITLES[self._colouring.kind], TEXT_SIZE)
-        texts[1] = texts[1].removesuffix(UNITS[self._colouring.kind]).strip()
         for text, fraction, side in zip(texts, (0.0, 0.5, 1.0), ("left", "center", "right")):
             self._write((MARGIN + fraction * width, bottom - 3), text, SMALL_SIZE, align=f"{side} top")
 
-    def _draw_plots(self, names: list[str], right: float) -> None:
+    def _draw_plots(self, plots: list[Plot], right: float) -> None:
         """Draw plots from the top down, and times below the last one."""
-        plots, history, (before, after, below, above) = self._plots.available(), self._plots.history, INSET
-        height = min(PLOT_HEIGHT, (HEIGHT - 2 * MARGIN - below) / len(names))
+        history, (before, after, below, above) = self._plots.history, INSET
+        height = min(PLOT_HEIGHT, (HEIGHT - 2 * MARGIN - below) / len(plots))
         top, left = HEIGHT - MARGIN, right - WIDTH
-        bottom = top - len(names) * height
+        bottom = top - len(plots) * height
         self._axes.fill_between((left, right), bottom - below, top, color=PAPER, alpha=0.9, linewidth=0.0)
-        for k, name in enumerate(names):
-            self._draw_plot(plots[name], left + before, right - after, top - (k + 1) * height, height - above)
+        for k, plot in enumerate(plots):
+            self._draw_plot(plot, left + before, right - after, top - (k + 1) * height, height - above)
         for x, text in ((left + before, f"{history.begin:.4g}"), (right - after, f"{history.times[-1]:.4g} s")):
             self._write((x, bottom - 3), text, TICK_SIZE, FAINT, "center top", halo=False)
 
@@ -121,17 +120,16 @@ class Annotations:
         title = f"{plot.title} [{plot.unit}]" if plot.unit else plot.title
         beside = self._write((left - INSET[0] + 8, top + 5), title, SMALL_SIZE, halo=False)
         x = left + (right - left) * (history.times - history.begin) / ((history.times[-1] - history.begin) or 1.0)
-        for series, (low, high) in zip(shown, bottom + height * curves):
-            self._axes.fill_between(x, low, high, facecolor=(*series.colour, 0.5), edgecolor=series.colour, linewidth=1.4)
+        for one, (low, high) in zip(shown, bottom + height * curves):
+            self._axes.fill_between(x, low, high, facecolor=(*one.colour, 0.5), edgecolor=one.colour, linewidth=1.4)
         values = [f"{value:.3g} {plot.unit}".replace("nan", "-").rstrip() for value in history.last[columns]]
         in_row = len(title) + sum(len(one.name) for one in shown) <= ROW
-        for k, (series, value) in enumerate(zip(shown, values)):
+        for k, (one, value) in enumerate(zip(shown, values)):
             if in_row:
-                text = series.name if len(shown) > 1 else value
-                beside = self._write((1, 0), text, SMALL_SIZE, series.colour, halo=False, beside=beside, shift=(8, 0))
+                text = one.name if len(shown) > 1 else value
+                beside = self._write((1, 0), text, SMALL_SIZE, one.colour, halo=False, beside=beside, shift=(8, 0))
             else:
-                at = left + 4, top - 2 - k * SMALL_SIZE
-                self._write(at, f"{series.name}  {value}", SMALL_SIZE, series.colour, "left top")
+                self._write((left + 4, top - 2 - k * SMALL_SIZE), f"{one.name}  {value}", SMALL_SIZE, one.colour, "left top")
 
 
 def curves_of(low: np.ndarray, high: np.ndarray, log: bool, n: float) -> tuple[np.ndarray, np.ndarray]:

@@ -105,8 +105,7 @@ class History:
         row += [solved * report.newton_iterations, solved * report.linear_iterations]
         row += [touched * report.contact_iterations / report.steps, touched * report.n_contacts, 1e3 * seconds / report.steps]
         row += [*(100.0 * np.array([getattr(errors, kind, None) for kind in ERROR_KINDS], dtype=float))]
-        new = [name for name in more if name not in self.columns]
-        if new:
+        if new := [name for name in more if name not in self.columns]:
             self.columns += new
             self.low, self.high = (np.pad(a, ((0, 0), (0, len(new))), constant_values=np.nan) for a in (self.low, self.high))
         self.last = np.append(row, [more.get(name, 0.0) for name in self.columns[len(QUANTITIES) :]])
@@ -136,8 +135,8 @@ def plain_history(history: History) -> dict:
     """Return the arrays of a history as plain data, only with the columns that plots can show."""
     columns = [*QUANTITIES, *(s.quantity for plot in PLOTS.values() if plot.many for s in series_of(plot, history))]
     used = [history.columns.index(name) for name in columns]
-    parts = {"low": history.low[:, used], "high": history.high[:, used], "last": history.last[used]}
-    return {"times": history.times, "begin": history.begin, "columns": columns, **parts}
+    low, high, last = history.low[:, used], history.high[:, used], history.last[used]
+    return {"times": history.times, "begin": history.begin, "columns": columns, "low": low, "high": high, "last": last}
 
 
 def series_of(plot: Plot, history) -> tuple[Series, ...]:
@@ -166,9 +165,9 @@ class PlotChoice:
         kept = {name: tuple(s for s in plot.series if enabled[s.needs]) for name, plot in PLOTS.items()}
         return {name: replace(PLOTS[name], series=series) for name, series in kept.items() if series}
 
-    def visible(self) -> list[str]:
-        """Return the names of the plots that are requested and available."""
-        return [name for name in self.available() if name in self.names]
+    def visible(self) -> list[Plot]:
+        """Return the plots that are requested and available."""
+        return [plot for name, plot in self.available().items() if name in self.names]
 
 
 class Plots(PlotChoice):
@@ -190,12 +189,13 @@ class Plots(PlotChoice):
     @property
     def enabled(self) -> dict[str, bool]:
         """Which `needs` of series the simulator meets now."""
-        return {"implicit": not self._sim.settings.explicit, "contact": self._touching, "error": self._errors}
+        touching = self._sim.plan.on["contact_forces"]
+        return {"implicit": not self._sim.settings.explicit, "contact": touching, "error": self._errors}
 
     def take(self, report: StepReport, seconds: float) -> None:
         """Record a step report; seconds: its wall time [s]. For `on_step` of a run."""
-        errors = self._sim.error_so_far if self._errors else None
-        self.history.take(report, seconds, self._sim.settings.explicit, self._touching, errors, **self._by_name())
+        met, errors = self.enabled, self._sim.error_so_far if self._errors else None
+        self.history.take(report, seconds, not met["implicit"], met["contact"], errors, **self._by_name())
 
     def _by_name(self) -> dict[str, float]:
         """Return the columns of the requested plots by pair or body: forces [N], torques [N m] and energies [J]."""
@@ -206,10 +206,6 @@ class Plots(PlotChoice):
         for body, energies in zip(sim.scene.bodies, sim._open().body_energies()) if kinds else ():
             found |= {f"{kind}: {body.name}": getattr(energies, kind) for kind in kinds}
         return found
-
-    @property
-    def _touching(self) -> bool:
-        return self._sim.plan.on["contact_forces"]
 
     def _why_unavailable(self, name: str) -> str:
         """Explain why a plot is not available."""
