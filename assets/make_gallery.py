@@ -1,16 +1,20 @@
-"""Draws the gallery's pictures: `python assets/make_gallery.py [DEMO ...]` (minutes) writes assets/gallery/*.png, one strip a
+"""Draws the gallery's pictures: `python assets/make_gallery.py [NAME ...]` (minutes) writes assets/gallery/*.png, one strip a
 scene.
 
-A strip shows a scene at a few moments, from the same place, side by side.
+A strip shows a scene at a few moments, from the same place, side by side. `film` and `film_again` are one run, drawn twice by the
+command line.
 """
 
 import sys
+import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+from PIL import Image
 
 import taisoft as ts
+from taisoft.cli import main as taisoft
 from taisoft.cli.scene_file import load_module
 from taisoft.files import write_bytes
 from taisoft.output.frames import SMALLEST, png_bytes
@@ -50,6 +54,42 @@ STRIPS = {
     "layered_beam": ((0.0, 0.5, 3.0), (440, 130), ((1.2, -0.05, 0.0), 2.0, 0.0, 4.0), "stress"),
     "twisting_bar": ((0.0, 0.75, 1.5, 4.0), (330, 200), ((0.0, 0.0, 0.0), 6.6, 32.0, 20.0)),
 }
+FILM = "drop_everything"  # which gallery/film.png and film_again.png show
+FILM_FRAMES, FILM_SIZE, FILM_FPS = (0, 15, 25, 40, 65), (260, 330), 50
+COLOURS = {"bunny": "#f2ede4", "plank": "#c98b4e", "ring": "#3d7a78", "ball": "#d9583b", "box": "#2f4b6e"}
+AROUND = (
+    "position = [[4.0, 1.7, 4.0], [1.5, 2.2, 5.8], [-4.2, 1.8, 4.0]], target = [[0, 1.25, 0], [0, 1.0, 0], [-0.15, 0.5, 0]], "
+    "fov = 32, times = [0, 0.6, 1.3]"
+)
+ABOVE = "position = [[5, 2.6, 1.5], [1.0, 4.8, 2.6]], target = [[0, 1.15, 0], [0, 0.4, 0]], fov = 34, times = [0, 1.3]"
+GREY = "#8d8378"
+LOOKS = {
+    "film": {"scene.background": '["#fbf4e9", "#dfc9ae"]', "ground.colour": "#efe0ca", "stone.colour": GREY, "step.colour": GREY}
+    | {f"{name}.colour": colour for name, colour in COLOURS.items()},
+    "film_again": {"scene.background": '["#11151c", "#2b3442"]', "ground.colour": "#39424f", "stone.opacity": "0.4"},
+}
+
+
+def films() -> dict[str, np.ndarray]:
+    """The strips of FILM in own colours with a moving camera, and of the same run, drawn again by stress from above."""
+    pictures = {}
+    with tempfile.TemporaryDirectory() as folder:
+        run = Path(folder) / "film"
+        size = "x".join(map(str, FILM_SIZE))
+        command = ["run", FILM, "--headless", "--no-usd", "--seconds", "1.3", "--fps", str(FILM_FPS), "--out", str(run)]
+        again = ["draw", str(run), "--colour", "stress", "--camera", ABOVE]
+        for name, words, out in (("film", [*command, "--camera", AROUND], run), ("film_again", again, run / "drawn")):
+            looks = [f"--set={key}={value}" for key, value in LOOKS[name].items()]
+            if taisoft([*words, "--size", size, *looks]):
+                raise SystemExit(f"{name} failed")
+            pictures[name] = side_by_side([np.asarray(Image.open(out / f"frames/{frame:05d}.png")) for frame in FILM_FRAMES])
+    return pictures
+
+
+def side_by_side(pictures: list[np.ndarray]) -> np.ndarray:
+    """Pictures of one size in a row, with a gap between them."""
+    gap = np.full((len(pictures[0]), GAP, 3), 255, dtype=np.uint8)
+    return np.concatenate([part for picture in pictures for part in (gap, picture)][1:], axis=1)
 
 
 def film(
@@ -82,8 +122,7 @@ def film(
 
     result = sim.run(seconds, on_frame, fps, on_step=on_step)
     drawing.close()
-    gap = np.full((size[1], GAP, 3), 255, dtype=np.uint8)
-    return np.concatenate([part for picture in pictures for part in (gap, picture)][1:], axis=1), result
+    return side_by_side(pictures), result
 
 
 def strip(
@@ -101,10 +140,12 @@ def strip(
 
 
 def main() -> None:
-    """Writes gallery/<demo>.png for the demos named, or for all."""
-    names = sys.argv[1:] or list(STRIPS)
+    """Writes gallery/<name>.png for the demos and films named, or for all."""
+    names = sys.argv[1:] or [*STRIPS, *LOOKS]
+    drawn = films() if set(names) & set(LOOKS) else {}
     for name in names:
-        data = png_bytes(strip(ASSETS.parent / "demos" / f"{name}.py", *STRIPS[name]), SMALLEST)
+        picture = drawn[name] if name in drawn else strip(ASSETS.parent / "demos" / f"{name}.py", *STRIPS[name])
+        data = png_bytes(picture, SMALLEST)
         path = ASSETS / "gallery" / f"{name}.png"
         if len(data) > MAX_BYTES:
             raise SystemExit(f"{path}: {len(data)} bytes, at most {MAX_BYTES} are meant to be kept")

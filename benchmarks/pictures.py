@@ -47,7 +47,7 @@ class NumpyOffscreen(Offscreen):
     def image(self, sim) -> np.ndarray:
         """Return a picture of sim's present state, as `Offscreen.image` does."""
         x, colours, lines = self._drawn(self.sampled(sim), self.size)
-        attributes = np.column_stack([colours, np.zeros((len(x), N_ATTRIBUTES - 3))])
+        attributes = np.column_stack([colours, np.zeros((len(x), N_ATTRIBUTES - 2))])
         points, triangles, attributes = self._triangles(x, attributes, lines)
         large = background((SAMPLES * self.size[0], SAMPLES * self.size[1]))
         rasterise(points, triangles, attributes[:, :3], self.camera.clipping[0], large)

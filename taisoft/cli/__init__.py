@@ -26,7 +26,7 @@ EXIT_BAD_INPUT = 2
 EXIT_OUTPUT = 3
 EXIT_SIGNAL = 128  # plus the signal's number: 130, 143
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
-BARE_WORD = re.compile(r"[A-Za-z_]\w*")
+BARE_WORD = re.compile(r"[A-Za-z_]\w*|#\w+")  # or a colour
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -10,22 +10,20 @@ from taisoft.cli import EXIT_SIGNAL, Signals
 from taisoft.cli.pictures import camera_of, picture_options, slowness
 from taisoft.cli.recording import has_bar, make_video
 from taisoft.errors import SceneError, reworded
-from taisoft.output.files import OutputFolder
+from taisoft.output.files import DRAWN_NAME, OutputFolder
 from taisoft.output.report import frame_rate
 from taisoft.scene.look import background_of, check_follow
 from taisoft.view.pictures import picture_writer
 from taisoft.view.states import StoredRun
 
-FOLDER = "drawn"  # in the run's folder
-
 
 def draw(arguments: Namespace) -> int:
     """Draw the run and return the exit status. Bad input is refused before any file is written."""
     with Signals("ending with the pictures drawn so far") as signals:
-        run, out = StoredRun(arguments.scene), Path(arguments.out or Path(arguments.scene) / FOLDER)
+        run, out = StoredRun(arguments.scene), Path(arguments.out or Path(arguments.scene) / DRAWN_NAME)
         if out.resolve() == run.folder.resolve():
             raise SceneError(
-                f"--out {out}: it is the folder of the run itself: name another, or leave it out for {run.folder / FOLDER}"
+                f"--out {out}: it is the folder of the run itself: name another, or leave it out for {run.folder / DRAWN_NAME}"
             )
         options, slow = picture_options(arguments), slowness(arguments)
         run.check_colour(options.colour)
@@ -38,6 +36,7 @@ def draw(arguments: Namespace) -> int:
         with closing(OutputFolder(out, arguments.overwrite)) as folder:
             signals.run_began()
             writer = picture_writer(folder.path, run.scene, replace(options, bar=has_bar(options.colour)))
+            writer.renderer.colouring.fix(map(run.state, run.frames))
             drawn = 0
             with closing(writer):
                 for index in run.frames:

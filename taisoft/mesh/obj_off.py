@@ -13,26 +13,53 @@ from taisoft.errors import MeshError, one_line
 from taisoft.mesh.safe_reading import content_lines
 from taisoft.mesh.words import to_float, to_int
 
+RULES = {"v": "v and three coordinates", "vt": "vt and one or two numbers"}  # of .obj
+RULES["f"] = "f and at least 3 corners, all or none of them with a vt"
 HEAD = re.compile(r"(?:ST)?C?N?OFF(\d*)$")  # of .off; some programs write no space before the counts
 
 
-def read_obj(name: str, data: bytes) -> tuple[np.ndarray, list[np.ndarray]]:
-    """Return positions and polygons, (1,k) each, of a Wavefront file."""
-    points, polygons = [], []
-    for number, words in content_lines(name, data):
+def read_obj(name: str, data: bytes) -> tuple[np.ndarray, list[np.ndarray], list[np.ndarray] | None, dict[str, list[int]]]:
+    """Return positions, polygons, (1,k) each, their UVs, (1,k,2) each, and subsets of polygons by name, of a Wavefront file.
+
+    UVs are NaN at polygons without any, and None if none has some. Subsets are those of `usemtl`, else of `g`, else of `o`.
+    """
+    lines = content_lines(name, data)
+    points, polygons, texture, rows, n = [], [], [], [], sum(words[0] == "vt" for _, words in lines)  # rows of texture; n: none
+    current, members = dict.fromkeys(("usemtl", "g", "o"), ""), {"usemtl": {}, "g": {}, "o": {}}
+    for number, words in lines:
         try:
             if words[0] == "v":
                 x, y, z = words[1:4]
                 points.append((to_float(x), to_float(y), to_float(z)))
+            elif words[0] == "vt":
+                u, v = (*words[1:3], "0")[:2]
+                texture.append((to_float(u), to_float(v)))
+            elif words[0] in current:
+                current[words[0]] = " ".join(words[1:])
             elif words[0] == "f":
-                corners = [to_int(word.split("/", 1)[0]) for word in words[1:]]
+                corners, *of_texture = zip(*(_corner(word) for word in words[1:]), strict=True)
                 if len(corners) < 3 or 0 in corners or max(map(abs, corners)) > len(data):
                     raise ValueError
+                for k in of_texture[0] if of_texture else ():
+                    if not -len(texture) <= k <= n or k == 0:
+                        raise MeshError(f"{name}: line {number}: vt {k} does not exist ({n} are given)")
+                for kind, called in current.items():
+                    if called:
+                        members[kind].setdefault(called, []).append(len(polygons))
                 polygons.append(np.array([[k - 1 if k > 0 else len(points) + k for k in corners]]))
+                given = of_texture[0] if of_texture else (n + 1,) * len(corners)
+                rows.append(np.array([[k - 1 if k > 0 else len(texture) + k for k in given]]))
         except ValueError:
-            rule = "v and three coordinates, or f and at least 3 corners"
-            raise MeshError(f"{name}: line {number}: expected {rule}, not {one_line(' '.join(words))!r}") from None
-    return np.array(points, dtype=np.float64).reshape(-1, 3), polygons
+            raise MeshError(f"{name}: line {number}: expected {RULES[words[0]]}, not {one_line(' '.join(words))!r}") from None
+    table = np.array([*texture, (np.nan, np.nan)])
+    uvs = [table[one] for one in rows] if any(one.min() < n for one in rows) else None
+    return np.array(points, dtype=np.float64).reshape(-1, 3), polygons, uvs, next((of for of in members.values() if of), {})
+
+
+def _corner(word: str) -> tuple[int, ...]:
+    """Return the numbers of a corner's v and, if it is given, its vt."""
+    position, *texture = word.split("/")[:2]
+    return (to_int(position), *(to_int(k) for k in texture if k))
 
 
 def read_off(name: str, data: bytes) -> tuple[np.ndarray, list[np.ndarray]]:

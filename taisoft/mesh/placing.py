@@ -23,7 +23,7 @@ UP = {up: turn[:, 1] for up, turn in FROM_Y_UP.items()}  # -> unit vector (3,)
 
 
 def place(mesh: TetMesh | SurfaceMesh, up: str = "y", scale: float = 1.0, rotate=(0.0, 0.0, 0.0), at=None, to: str = "y"):
-    """Return a copy of a mesh or a surface, placed, with its regions and fibres.
+    """Return a copy of a mesh or a surface, placed, with its regions, fibres, UVs and subsets.
 
     up: axis of the given vertices that points up, "x", "y" or "z". to: that of the scene, "y" or "z", to which it is turned: "z"
     to "y" turns (x, y, z) to (x, z, -y), "x" to "y" to (-y, x, z). scale: factor, such as 0.001 for a file in millimetres.
@@ -39,12 +39,13 @@ def place(mesh: TetMesh | SurfaceMesh, up: str = "y", scale: float = 1.0, rotate
         shift = checked_vector(at, "place", "at") - underside(vertices, to)
         vertices = vertices + shift
     if isinstance(mesh, SurfaceMesh):
-        return SurfaceMesh(vertices, mesh.triangles, mesh.source, list(mesh.warnings))
+        return SurfaceMesh(vertices, mesh.triangles, mesh.source, list(mesh.warnings), mesh.uvs, mesh.subsets)
     with warnings.catch_warnings(record=True) as found:
         warnings.simplefilter("always")
         fibres = None if mesh.fibres is None else mesh.fibres @ turn.T
         middles = None if mesh.mid_edge is None else mesh.mid_edge @ turn.T + shift
         labels = {"mid_edge": middles, "regions": mesh.regions, "region_names": dict(mesh.region_names), "fibres": fibres}
+        labels |= {"surface_uvs": mesh.surface_uvs, "surface_subsets": mesh.surface_subsets}
         placed = TetMesh(vertices, mesh.tets, **labels, source=mesh.source)
     for warning, text in zip(found, placed.warnings):  # one for each
         if text not in mesh.warnings:

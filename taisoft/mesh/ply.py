@@ -16,6 +16,7 @@ from taisoft.errors import MeshError
 from taisoft.mesh.words import MAX_EXACT_INT, Words, to_int
 
 LISTS = ("vertex_indices", "vertex_index")
+UVS = (("s", "t"), ("u", "v"), ("texture_u", "texture_v"))  # names of texture coordinates of vertices
 STRUCT_TYPES = {"i1": "b", "u1": "B", "i2": "h", "u2": "H", "i4": "i", "u4": "I", "i8": "q", "u8": "Q", "f8": "d"}
 _SIZES = {"char": "i1", "short": "i2", "int": "i4", "float": "f4", "double": "f8", "float32": "f4", "float64": "f8"}
 TYPES = _SIZES | {f"u{name}": f"u{_SIZES[name][1]}" for name in ("char", "short", "int")}
@@ -41,8 +42,11 @@ class Element(NamedTuple):
     line: int
 
 
-def read_ply(name: str, data: bytes) -> tuple[np.ndarray, list[np.ndarray]]:
-    """Return positions (n,3) and polygons, arrays (k,corners). name: the file's, for messages. Raises MeshError."""
+def read_ply(name: str, data: bytes) -> tuple[np.ndarray, list[np.ndarray], list[np.ndarray] | None, dict]:
+    """Return positions (n,3), polygons, arrays (k,corners), their UVs, (k,corners,2), or None, and no subsets.
+
+    name: the file's, for messages. Raises MeshError.
+    """
     head = _HEAD.match(data)
     if head is None:
         lines = data.split(b"\n", 1000)
@@ -56,7 +60,7 @@ def read_ply(name: str, data: bytes) -> tuple[np.ndarray, list[np.ndarray]]:
         rows = _Rows(words.floats(words.left()).tobytes(), "=", lambda text, at: words.error(text, at // 8))
         for element in elements:
             element.properties[:] = [one._replace(type="f8", count=one.count and "f8") for one in element.properties]
-    points, polygons = np.empty((0, 3)), []
+    points, polygons, uvs = np.empty((0, 3)), [], None
     for element in elements:
         lists, numbers = ({p.name: k for k, p in enumerate(element.properties) if bool(p.count) == own} for own in (True, False))
         corners = next((lists[one] for one in LISTS if one in lists), None)
@@ -67,6 +71,8 @@ def read_ply(name: str, data: bytes) -> tuple[np.ndarray, list[np.ndarray]]:
         for first, values in rows.groups(element):
             if element.name == "vertex":
                 points = np.column_stack([values[numbers[axis]] for axis in "xyz"])
+                pair = next((pair for pair in UVS if numbers.keys() >= set(pair)), None)
+                uvs = None if pair is None else np.column_stack([values[numbers[axis]] for axis in pair])
             elif element.name == "face":
                 nodes = values[corners]
                 if nodes.shape[1] < 3:
@@ -77,7 +83,7 @@ def read_ply(name: str, data: bytes) -> tuple[np.ndarray, list[np.ndarray]]:
                     raise rows.error(f"expected whole numbers of vertices below {n_points:.0f}", int(first[bad.argmax()]))
                 polygons.append(nodes.astype(np.int64))
     rows.end()
-    return points, polygons
+    return points, polygons, None if uvs is None else [uvs[nodes] for nodes in polygons], {}
 
 
 def _unfit(name: str, element: Element, rule: str) -> MeshError:

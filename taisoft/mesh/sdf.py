@@ -148,12 +148,7 @@ def greatest_depth(vertices: np.ndarray, triangles: np.ndarray, points: np.ndarr
 
 def nearest_points(vertices: np.ndarray, triangles: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the nearest points (k,3) [m] of triangles (t,3), which may be open, to points (k,3), and their triangles (k,)."""
-    surface = _Triangles(vertices, triangles)
-    point, triangle = surface.balls.pairs(points, surface.upper(points))
-    squared, offset, _ = surface.nearest(points[point], triangle)
-    order = np.lexsort((triangle, squared, point))
-    best = order[np.searchsorted(point[order], np.arange(len(points)))]
-    return points - offset[best], triangle[best]
+    return Triangles(vertices, triangles).closest(points)
 
 
 class BallTree:
@@ -175,7 +170,7 @@ class BallTree:
         return tuple(np.concatenate(found, axis=1))
 
 
-class _Triangles:
+class Triangles:
     """Triangles with precomputed data for distances."""
 
     def __init__(self, vertices: np.ndarray, triangles: np.ndarray):
@@ -190,6 +185,17 @@ class _Triangles:
         """Return upper bounds (p,) [m] of the distances of points (p,3)."""
         triangle = self._tree.query(points)[1] if len(points) else np.zeros(0, dtype=np.int64)
         return np.sqrt(self.nearest(points, triangle)[0])
+
+    def closest(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the nearest points (p,3) [m] to points (p,3), and their triangles (p,)."""
+        return self.closest_of(points, *self.balls.pairs(points, self.upper(points)))
+
+    def closest_of(self, points: np.ndarray, point: np.ndarray, triangle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the same among given pairs of a point and a triangle, (k,) each, some for every point."""
+        squared, offset, _ = self.nearest(points[point], triangle)
+        order = np.lexsort((triangle, squared, point))
+        best = order[np.searchsorted(point[order], np.arange(len(points)))]
+        return points - offset[best], triangle[best]
 
     def nearest(self, points: np.ndarray, triangle: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return squared distances (p,), offsets (p,3) from the nearest point, and its feature (p,), a column of `pseudonormals`.
@@ -216,7 +222,7 @@ class _Triangles:
         )
 
 
-class _Surface(_Triangles):
+class _Surface(Triangles):
     """A closed surface with precomputed data for distance and sign."""
 
     def __init__(self, vertices: np.ndarray, triangles: np.ndarray):

@@ -23,7 +23,8 @@ from taisoft.mesh.ply import read_ply
 from taisoft.mesh.safe_reading import read_content, run_child
 from taisoft.mesh.stl import read_stl
 from taisoft.mesh.tet_mesh import TetMesh, checked_array
-from taisoft.mesh.topology import connected_pieces, crack_widths, linked_groups, merge_labels, triangle_edges
+from taisoft.mesh.texture import checked_subsets, checked_uvs, subsets_of, transferred
+from taisoft.mesh.topology import Faces, connected_pieces, crack_widths, linked_groups, merge_labels, triangle_edges
 
 READERS = {".obj": read_obj, ".stl": read_stl, ".ply": read_ply, ".off": read_off}
 FORMATS = tuple(READERS)
@@ -40,13 +41,17 @@ class SurfaceMesh:
     """Triangles in space, checked and read-only.
 
     vertices: (n,3) float64 [m]; triangles: (t,3) int64, counted from 0; source: origin, which starts every message; warnings:
-    changes made by the reader. Accepts anything that NumPy converts to such arrays. Raises MeshError.
+    changes made by the reader; uvs: (t,3,2) float64 texture coordinates of each triangle's corners, or None; subsets: {name:
+    triangles (k,) int64}, such as those of one material, without common ones. Accepts anything that NumPy converts to such
+    arrays. Raises MeshError.
     """
 
     vertices: np.ndarray
     triangles: np.ndarray
     source: str = "surface"
     warnings: list[str] = field(default_factory=list)
+    uvs: np.ndarray | None = None
+    subsets: dict[str, np.ndarray] = field(default_factory=dict)
 
     def __post_init__(self):
         vertices = checked_array(self.vertices, "vertices", 3, "fiu", "numbers", self._error).astype(np.float64)
@@ -58,9 +63,11 @@ class SurfaceMesh:
         if len(bad):
             t, k = bad[0]
             raise MeshError(f"{self.source}: triangle {t}: vertex {triangles[t, k]} does not exist ({len(vertices)} vertices)")
-        for field_name, array in (("vertices", vertices), ("triangles", triangles.astype(np.int64))):
+        triangles, n = triangles.astype(np.int64), len(triangles)
+        for array in (vertices, triangles):
             array.setflags(write=False)
-            object.__setattr__(self, field_name, array)  # the only way to store a value in a frozen record
+        texture = {"uvs": checked_uvs(self.uvs, n, self._error), "subsets": checked_subsets(self.subsets, n, self._error)}
+        self.__dict__.update(vertices=vertices, triangles=triangles, **texture)  # the only way to store values in a frozen record
 
     def _error(self, text: str) -> MeshError:
         return MeshError(f"{self.source}: {text}")
@@ -151,8 +158,8 @@ def read_surface(path, weld: float = 0.0) -> SurfaceMesh:
 
     path: the file, or another library's surface with `vertices` (n,3) and `faces` (t,3), such as a trimesh.Trimesh. weld: merge
     vertices at most this far apart [m]; 0 merges only equal ones (files with texture or normals per corner repeat vertices).
-    Triangles without area, duplicates and unused vertices are removed; all but the last are reported by a warning. Raises
-    MeshError.
+    Triangles without area, duplicates and unused vertices are removed; all but the last are reported by a warning. Texture
+    coordinates of .obj and .ply, and in .obj materials, else groups, else objects, are its uvs and subsets. Raises MeshError.
     """
     surface = as_surface(path, weld)
     if surface is not path:
@@ -161,11 +168,24 @@ def read_surface(path, weld: float = 0.0) -> SurfaceMesh:
     name, ending = str(file), file.suffix.lower()
     if ending not in FORMATS:
         raise MeshError(f"{name}: a surface is read from {', '.join(FORMATS)}, not from {ending or 'a file without ending'}")
-    points, polygons = READERS[ending](name, read_content(file))
-    # Split each polygon as a fan around its first corner.
-    fans = [nodes[:, [0, k, k + 1]] for nodes in polygons for k in range(1, nodes.shape[1] - 1)]
-    triangles = np.concatenate([np.empty((0, 3), dtype=np.int64), *fans])
-    return clean_surface(SurfaceMesh(points, triangles, name), weld)
+    points, polygons, *texture = READERS[ending](name, read_content(file))
+    uvs, subsets = texture or (None, {})
+    triangles, notes = _fans(polygons, np.empty((0, 3), dtype=np.int64)), []
+    if uvs is not None:
+        uvs = _fans(uvs, np.empty((0, 3, 2)))
+        missing = np.isnan(uvs).any(axis=(1, 2))
+        uvs[missing] = 0.0
+        if missing.any():
+            notes = [
+                f"{missing.sum()} triangles have no texture coordinates, and get 0, the first is triangle {missing.argmax()}"
+            ]
+    parents = np.repeat(np.arange(len(polygons)), [nodes.shape[0] * (nodes.shape[1] - 2) for nodes in polygons])
+    return clean_surface(SurfaceMesh(points, triangles, name, notes, uvs, subsets_of(subsets, parents)), weld)
+
+
+def _fans(polygons: list[np.ndarray], none: np.ndarray) -> np.ndarray:
+    """Return values at the corners of triangles: each polygon is split as a fan around its first corner. none: for no polygon."""
+    return np.concatenate([none, *(one[:, [0, k, k + 1]] for one in polygons for k in range(1, one.shape[1] - 1))])
 
 
 def as_surface(mesh, weld: float = 0.0):
@@ -180,7 +200,7 @@ def clean_surface(surface: SurfaceMesh, weld: float) -> SurfaceMesh:
     name, points, triangles = surface.source, surface.vertices, surface.triangles
     if isinstance(weld, bool) or not isinstance(weld, Real) or not 0.0 <= weld < np.inf:
         raise MeshError(f"{name}: weld must be a distance of at least 0 m, not {weld!r}")
-    notes = []
+    notes = list(surface.warnings)
     labels = merge_labels(points, float(weld))
     first = np.unique(labels, return_index=True)[1]
     if len(first) < len(points):
@@ -194,13 +214,14 @@ def clean_surface(surface: SurfaceMesh, weld: float) -> SurfaceMesh:
     for which, what in ((flat, "without area"), (doubled & ~flat, "given twice")):
         if which.any():
             notes.append(f"{which.sum()} triangles {what} are left out, the first is triangle {which.argmax()}")
-    triangles = triangles[~(flat | doubled)]
+    kept = np.flatnonzero(~(flat | doubled))
+    triangles, uvs = triangles[kept], None if surface.uvs is None else surface.uvs[kept]
     if len(triangles) == 0:
         raise MeshError(f"{name}: no triangle has an area")
     used, inverse = np.unique(triangles, return_inverse=True)
     for text in notes:
         warnings.warn(f"{name}: {text}", UserWarning, stacklevel=3)
-    return SurfaceMesh(points[used], inverse.reshape(-1, 3), name, notes)
+    return SurfaceMesh(points[used], inverse.reshape(-1, 3), name, notes, uvs, subsets_of(surface.subsets, kept))
 
 
 def tetrahedralize(surface: SurfaceMesh, edge_length: float | None = None, envelope: float | None = None) -> TetMesh:
@@ -208,8 +229,8 @@ def tetrahedralize(surface: SurfaceMesh, edge_length: float | None = None, envel
 
     edge_length: approximate edge length of the tets [m]; None for a twentieth of the diagonal. envelope: largest distance [m]
     of the new surface from the old one, except where holes are closed; None for a tenth of edge_length. Warns of the surface's
-    faults, and of the volume with holes closed. Raises MeshError if the extra `mesh` is missing, nothing is enclosed, or the
-    mesher fails.
+    faults, and of the volume with holes closed. The mesh's surface gets the uvs and subsets of the nearest triangles. Raises
+    MeshError if the extra `mesh` is missing, nothing is enclosed, or the mesher fails.
     """
     surface = as_surface(surface)
     if not isinstance(surface, SurfaceMesh):
@@ -231,7 +252,10 @@ def tetrahedralize(surface: SurfaceMesh, edge_length: float | None = None, envel
     inverted = np.linalg.det(edges) < 0
     tets[inverted] = tets[inverted][:, [0, 2, 1, 3]]
     used, inverse = np.unique(tets, return_inverse=True)
-    mesh = TetMesh(vertices[used], inverse.reshape(-1, 4), source=name)
+    vertices, tets = vertices[used], inverse.reshape(-1, 4)
+    faces = Faces(tets)
+    uvs, subsets = transferred(surface, vertices, faces.triangles[faces.surface()])
+    mesh = TetMesh(vertices, tets, surface_uvs=uvs, surface_subsets=subsets, source=name)
     volume_error = abs(mesh.volumes.sum() - abs(surface.volume))
     if (inward or not faults) and volume_error > envelope * surface.area:
         raise MeshError(

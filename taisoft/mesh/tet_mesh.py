@@ -17,6 +17,7 @@ from taisoft.machine import require
 from taisoft.mesh.fibres import FIBRES, checked_fibres
 from taisoft.mesh.quality import edge_lengths, mean_ratio
 from taisoft.mesh.regions import checked_names, checked_regions, region_id, region_text
+from taisoft.mesh.texture import checked_subsets, checked_uvs
 from taisoft.mesh.topology import (
     Faces,
     connected_pieces,
@@ -59,9 +60,11 @@ class TetMesh(Guarded):
     flipped: int64 indices of the tets whose orientation was changed. n_components: number of parts connected by vertices.
     regions: (m,) int64, of each tet, or None; region_ids: tuple of those that tets are in, ascending; region_names: {region:
     name}, of regions that have one. mid_edge: (k,3) float64 [m], the nodes on the edges of a second-order mesh, which
-    curve bodies of order 2, or None. fibres: (m,3) directions of fibres, of any length, 0 in tets without, or None. warnings:
-    list of str, each also issued as a UserWarning. recipe: for a mesh from `box_mesh`, `sheet_mesh`, `ball_mesh` or
-    `cylinder_mesh` the shape's name and the arguments that reproduce its arrays, else None.
+    curve bodies of order 2, or None. fibres: (m,3) directions of fibres, of any length, 0 in tets without, or None. surface_uvs:
+    (t,3,2) texture coordinates of the corners of `surface`, or None; surface_subsets: {name: rows (k,) of it}, without common
+    ones, such as those of one material. warnings: list of str, each also issued as a UserWarning. recipe: for a mesh from
+    `box_mesh`, `sheet_mesh`, `ball_mesh` or `cylinder_mesh` the shape's name and the arguments that reproduce its arrays, else
+    None.
     """
 
     _error = MeshAttributeError
@@ -76,6 +79,8 @@ class TetMesh(Guarded):
         region_names: dict[int, str] | None = None,
         fibres=None,
         mid_edge=None,
+        surface_uvs=None,
+        surface_subsets=None,
         source: str | None = None,
         notes: tuple[str, ...] = (),
     ):
@@ -85,8 +90,9 @@ class TetMesh(Guarded):
         them and list them in `warnings` instead of refusing them. regions: (m,) integers, which say what material each tet is
         made of, see `Scene.add_body`; region_names: names of some or all of these numbers. fibres: (m,3)
         numbers. mid_edge: (k,3) [m], nodes on the k edges, which are sorted by their smaller and then by their larger vertex:
-        bodies of order 2 are curved by them, others ignore them. source: the mesh's origin, such as a file's name, which starts
-        every message. notes: a reader's warnings, added to `warnings`. Raises MeshError.
+        bodies of order 2 are curved by them, others ignore them. surface_uvs, surface_subsets: for the rows of `surface`. source:
+        the mesh's origin, such as a file's name, which starts every message. notes: a reader's warnings, added to `warnings`.
+        Raises MeshError.
         """
         self.source = source
         self.recipe: dict | None = None
@@ -106,6 +112,8 @@ class TetMesh(Guarded):
         rows = faces.surface()
         self.surface = faces.triangles[rows]
         self.surface_tets = rows // 4
+        self.surface_uvs = checked_uvs(surface_uvs, len(rows), self._mesh_error)
+        self.surface_subsets = checked_subsets(surface_subsets, len(rows), self._mesh_error)
         self.n_components = int(connected_pieces(self.tets, self.n_verts)[0])
         self._warn_flat()
         self._warn_joints(faces)

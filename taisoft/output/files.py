@@ -15,12 +15,14 @@ from taisoft.files import part_path
 
 LOCK_NAME = "taisoft.lock"
 CHECKPOINT_NAME, PVD_NAME = "checkpoint.npz", "scene.pvd"
-RESULT_FILES = ("report.json", "steps.csv", "frames.csv", "scene.usdc", PVD_NAME, CHECKPOINT_NAME, "video.mp4")
+DRAWN_NAME = "drawn"  # folder of the pictures of `taisoft draw`, in that of the run
+RESULT_FILES = ("report.json", "steps.csv", "frames.csv", "scene.usdc", PVD_NAME, CHECKPOINT_NAME, "video.mp4", "drawn/video.mp4")
 REPORT_FILES = ("report.json", "steps.csv", PVD_NAME)  # removed at once: beside another run's results they would be wrong
 # Left by a killed writer: see `taisoft.files.part_path`; USD adds temporary files with a suffix of its own
 TEMPORARY = re.compile(r"\.\d+-\d+\.part$|\.usdc\.\d+-\d+\.[A-Za-z0-9]{6}$")
 # folder -> pattern of a run's files in it, one for each frame or chunk of frames
 RESULT_FOLDERS = {"frames": "[0-9]*.png", "chunks": "points_*.usdc", "vtu": "[0-9]*.vtu", "states": "*.npz"}
+RESULT_FOLDERS |= {"drawn/frames": RESULT_FOLDERS["frames"]}
 
 
 @contextmanager

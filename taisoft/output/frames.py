@@ -3,11 +3,9 @@
 The video is encoded by ffmpeg: the one on PATH, else that of the extra `video`.
 """
 
-import queue
 import shutil
 import struct
 import subprocess
-import threading
 import zlib
 from collections.abc import Callable
 from importlib.util import find_spec
@@ -17,46 +15,39 @@ import numpy as np
 
 from taisoft.errors import OutputError
 from taisoft.files import replacing, write_bytes
+from taisoft.output.background import BackgroundWriter
 from taisoft.output.files import make_folder
 
 FRAMES_NAME, VIDEO_NAME = "frames", "video.mp4"
-WAITING = 8  # pictures, of 2.8 MB each at 1280 x 720
 COMPRESSION, SMALLEST = 2, 9  # zlib levels; 4 takes 1.7 times as long as 2 for a fifth fewer bytes, 9 several times as long
 TIMEOUT = 600.0  # of the encoding [s]
 ENCODING = "-c:v libx264 -crf 18 -pix_fmt yuv420p -vf pad=ceil(iw/2)*2:ceil(ih/2)*2 -movflags +faststart -f mp4"
 
 
 class FrameWriter:
-    """Observer that writes folder/frames/<index>.png, in a thread, so that the simulation goes on meanwhile.
+    """Writes folder/frames/<index>.png of states, in a thread.
 
     folder: the run's folder; renderer: an object with `image(state) -> uint8 (height, width, 3)` and `close()`, such as
     `taisoft.view.offscreen.Offscreen`, which is closed with this writer; annotate: (picture, state, index) -> picture to write.
-    At most WAITING pictures wait; then `frame` waits too. A picture that cannot be written, for whatever reason, raises
-    OutputError at the next `frame`, `flush` or `close`; later ones are not written. Raises OutputError.
+    A picture that cannot be written raises OutputError at the next call; later ones are not written. Raises OutputError.
     """
 
     def __init__(self, folder: str | Path, renderer, annotate: Callable | None = None):
         self.folder = make_folder(Path(folder) / FRAMES_NAME)
-        self.renderer, self._annotate = renderer, annotate
-        self._waiting: queue.Queue[tuple[Path, np.ndarray] | None] = queue.Queue(WAITING)
-        self._error: OutputError | None = None
-        self._thread = threading.Thread(target=self._write_all, name="pictures", daemon=True)  # an exit does not wait for it
-        self._thread.start()
+        self.renderer, self._annotate, self._writer = renderer, annotate, BackgroundWriter()
 
     def frame(self, state, index: int) -> None:
         """Draw a state, to be written as picture number index. Raises OutputError."""
-        if not self._thread.is_alive():
+        if self._writer.closed:
             raise OutputError(f"picture {index} cannot be written to {self.folder}: its writer is closed")
-        self._raise()
         picture = self.renderer.image(state)
         if self._annotate is not None:
             picture = self._annotate(picture, state, index)
-        self._waiting.put((self.folder / f"{index:05d}.png", picture))
+        self._writer.write(self.folder / f"{index:05d}.png", _write_png, picture)
 
     def flush(self) -> None:
         """Wait until all pictures are written. Raises OutputError."""
-        self._waiting.join()
-        self._raise()
+        self._writer.flush()
 
     def kept(self, time: float) -> dict:
         """Return what pictures from time [s] on depend on, as `Offscreen.kept`."""
@@ -64,32 +55,14 @@ class FrameWriter:
 
     def close(self) -> None:
         """Write the pictures that wait, and close the renderer; a second call does nothing. Raises OutputError."""
-        if self._thread.is_alive():
-            self._waiting.put(None)
-            self._thread.join()
-            try:
-                self.renderer.close()
-            finally:
-                self._raise()
+        try:
+            self._writer.close()
+        finally:
+            self.renderer.close()
 
-    def _write_all(self) -> None:
-        """Write pictures until None comes."""
-        while (item := self._waiting.get()) is not None:
-            try:
-                if self._error is None:
-                    write_bytes(item[0], png_bytes(item[1]))
-            except OutputError as error:  # raised in the thread that draws
-                self._error = error
-            except Exception as error:
-                self._error = OutputError(f"cannot write {item[0]}: {type(error).__name__}: {error}")
-                self._error.__cause__ = error
-            finally:
-                self._waiting.task_done()
-        self._waiting.task_done()
 
-    def _raise(self) -> None:
-        if self._error is not None:
-            raise self._error
+def _write_png(path: Path, picture: np.ndarray) -> None:
+    write_bytes(path, png_bytes(picture))
 
 
 def png_bytes(image: np.ndarray, level: int = COMPRESSION) -> bytes:

@@ -13,9 +13,9 @@ the linear triangles and tets that its elements are cut into, with all its nodes
 Both carry `primvars:vonMisesStress` [Pa]. If there can be contacts, the surface also carries `primvars:contactImpulse` [N s], the
 impulse of the last step before the frame on each point. `nodal_fields.py` defines both. A run with error=True adds
 `primvars:estimatedError` [m], `Simulator.nodal_errors`, -1 where unknown.
-An obstacle is `/World/<name>` with `surface` and `material`; its points change over time if it follows a path. A half-space
-whose square lies entirely within others is left out. A spring or a tendon is `/World/<name>`, see `usd_curves.py`. `/View` holds
-a camera and lights (`usd_scene.py`).
+Surfaces have normals and velocities (`usd_surface.py`). An obstacle is `/World/<name>` with `surface` and `material`; its points
+change over time if it follows a path. A half-space whose square lies entirely within others is left out. A spring or a tendon is
+`/World/<name>`, see `usd_curves.py`. `/View` holds a camera and lights (`usd_scene.py`).
 """
 
 import math
@@ -30,12 +30,14 @@ from taisoft.mesh.usd_content import usd_message
 from taisoft.output.files import make_folder, output_errors
 from taisoft.output.nodal_fields import UNKNOWN_ERROR, NodalMean, von_mises
 from taisoft.output.usd_curves import TENSION
-from taisoft.output.usd_scene import ERROR, IMPULSE, ROOT, STRESS, TRANSLATE, scene_layer
+from taisoft.output.usd_scene import OF_CAMERA, scene_layer
+from taisoft.output.usd_surface import ERROR, IMPULSE, NORMALS, ROOT, STRESS, VELOCITIES
 
 SCENE_NAME = "scene.usdc"
 CHUNKS_NAME = "chunks"
 SAME_FRAME = 1e-8  # relative error of a frame's time, from the rounding of dt and of its sum, that its time code does not show
-TIME_VARYING = {"points", "extent", TRANSLATE, *(f"primvars:{name}" for name in (STRESS, IMPULSE, ERROR, TENSION))}  # attributes
+INSTANT = 0.01  # of a frame: the time over which the velocity of an obstacle on a path is a difference
+TIME_VARYING = {"points", "extent", VELOCITIES, NORMALS, STRESS, IMPULSE, ERROR, f"primvars:{TENSION}", *OF_CAMERA}  # attributes
 
 
 class UsdWriter:
@@ -78,7 +80,7 @@ class UsdWriter:
 
     def _take_over(self, old: list[Path]) -> None:
         """Check the files of an earlier run, and take over what later frames depend on."""
-        eye = None
+        transform = None
         for path in old:
             layer = _opened(path)
             if layer.timeCodesPerSecond != self._template.timeCodesPerSecond or _structure(layer) != _structure(self._template):
@@ -90,36 +92,36 @@ class UsdWriter:
             self._earlier.append(path)
             times = {track: layer.ListTimeSamplesForPath(track.points) for track, _ in self._obstacles}
             self._moved |= {track for track, codes in times.items() if codes and codes[0] <= self._kept}
-            if codes := [code for code in layer.ListTimeSamplesForPath(self._view.attribute) if code <= self._kept]:
-                eye = layer.QueryTimeSample(self._view.attribute, codes[-1])
-        if eye is not None:
-            self._view.resume(np.array(eye))
+            if codes := [code for code in layer.ListTimeSamplesForPath(self._view.transform) if code <= self._kept]:
+                transform = layer.QueryTimeSample(self._view.transform, codes[-1])
+        if transform is not None:
+            self._view.resume(np.array(transform))
 
     def frame(self, sim, index: int) -> None:
         """Record sim's state as frame index, which must ascend; the first, if not 0, counts from time 0. Raises OutputError."""
-        from pxr import Gf, Sdf
+        from pxr import Sdf
 
         moving = [one for one in self._obstacles if one[1].obstacle.path is not None or one[0] in self._moved]
-        moved = [(track, surface.at(sim.time).astype(np.float32)) for track, surface in moving]  # first, since it may raise
+        moved = [(track, surface.at(sim.time), self._velocities(surface, sim.time)) for track, surface in moving]  # it may raise
         x = sim.positions()
         curves = [] if self._curves is None else self._curves.samples(sim, x)
         if self._chunk is None:
             self._chunk = Sdf.Layer.CreateAnonymous(".usdc")
             self._chunk.TransferContent(self._template)
-        points, fields = x.astype(np.float32), {STRESS: von_mises(self._mean(sim.stress())).astype(np.float32)}
+        fields = {STRESS: von_mises(self._mean(sim.stress())), VELOCITIES: sim.velocities()}
         if self._touching:
-            fields[IMPULSE] = nodal_impulses(sim.contacts(), len(x)).astype(np.float32)
+            fields[IMPULSE] = nodal_impulses(sim.contacts(), len(x))
         if self._errors:
-            fields[ERROR] = np.nan_to_num(sim.nodal_errors(), nan=UNKNOWN_ERROR).astype(np.float32)
-        samples = [(self._view.attribute, Gf.Vec3d(*self._view.follow(x).tolist()))]
+            fields[ERROR] = np.nan_to_num(sim.nodal_errors(), nan=UNKNOWN_ERROR)
+        samples = self._view.samples(sim.time, x)
         for track in self._tracks:
-            samples += track.samples(points, fields)
-        for track, corners in moved:
-            samples += track.samples(corners, {})
+            samples += track.samples(x, fields)
+        for track, corners, velocities in moved:
+            samples += track.samples(corners, {VELOCITIES: velocities})
         samples += curves
         for track, surface in moving:
             if track not in self._moved and self._latest >= 0.0:  # commanded since the frame before, where it was at rest
-                for path, value in track.samples(surface.vertices.astype(np.float32), {}):
+                for path, value in track.samples(surface.vertices, {VELOCITIES: np.zeros_like(surface.vertices)}):
                     self._chunk.SetTimeSample(path, self._latest, value)
             self._moved.add(track)
         if index == 0:
@@ -131,6 +133,11 @@ class UsdWriter:
         self._codes.append(self._latest)
         if len(self._codes) >= self.chunk_frames:
             self._publish_chunk()
+
+    def _velocities(self, surface, t: float) -> np.ndarray:
+        """Return the velocities (n,3) [m/s] of an obstacle's vertices at time t [s], just before it; at 0 just after it."""
+        h = INSTANT / self._fps
+        return (surface.at(max(t, h)) - surface.at(max(t - h, 0.0))) / h
 
     def close(self) -> None:
         """Complete scene.usdc and remove the chunks; without a frame no file is written. Raises OutputError.

@@ -168,13 +168,22 @@ class Viewpoint:
     def widened(self, points: np.ndarray, size: tuple[int, int], limit: float, free: tuple = WHOLE) -> "Viewpoint":
         """Return the camera moved back, to limit [m] at most, until points (n,3) lie within the free part less BORDER.
 
-        size, free: as for `framing`; the target moves to the middle of the part. Never moves nearer; points that are not finite
-        are ignored.
+        size, free: as for `framing`. The target moves towards what left, only so far that all that was seen stays in view: the
+        camera depends on where it is alone. It never moves nearer; points that are not finite are ignored.
         """
         local, (aim, half) = (points - self.target) @ self.axes.T, self._slopes(free, size, 1.0 - BORDER)
-        needed = np.abs(local[:, :2] - aim * local[:, 2:]) / half - local[:, 2:]
-        distance = float(np.max(needed, initial=0.0, where=np.isfinite(needed)))
-        return replace(self, distance=max(self.distance, min(distance, limit)), shift=tuple(aim))
+        local = local[np.isfinite(local).all(axis=1)]
+        x, depth, seen = local[:, :2], local[:, 2:], half * self.distance
+        low, high = (
+            (x - (aim + half) * depth).max(axis=0, initial=-np.inf),
+            (x - (aim - half) * depth).min(axis=0, initial=np.inf),
+        )
+        low, high = np.maximum(low, seen), np.minimum(high, -seen)
+        distance = max(self.distance, min(float(((low - high) / (2.0 * half)).max()), limit))
+        room = half * (distance - self.distance)
+        moved = np.clip((low + high) / 2, -room, room)
+        target = self.target + moved @ self.axes[:2] if moved.any() else self.target
+        return replace(self, target=target, distance=distance, shift=tuple(aim))
 
     def _slopes(self, free: tuple, size: tuple[int, int], fraction: float) -> tuple[np.ndarray, np.ndarray]:
         """Return the middle of a free part, as `shift`, and half of a fraction of its width and height, (2,) over the depth."""

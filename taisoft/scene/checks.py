@@ -14,6 +14,7 @@ import numpy as np
 from taisoft.errors import SceneError, reason, value_text
 
 LARGEST, SMALLEST = float(np.finfo(np.float32).max), float(np.finfo(np.float32).tiny)  # limits of 32-bit floats
+UNIT_TOLERANCE = 8 * np.finfo(np.float64).eps  # squared lengths this close to 1 are kept, so vectors read back unchanged
 MAX_TOLERANCE = {"newton_tolerance": 0.1}  # a residual of a tenth of the forces is no solution; others: 1
 
 
@@ -59,6 +60,17 @@ def array(value, what: str, shapes: tuple[tuple[int, ...], ...]) -> np.ndarray:
             entry = f"{what}: entry {at.tolist()}" if result.ndim else what
             raise SceneError(f"{entry} is {result[tuple(at)]:g}, {rule}")
     return result
+
+
+def unit(vector: np.ndarray, rule: str) -> np.ndarray:
+    """Return the unit vector (3,). Raises SceneError with the rule for a zero or infinite vector."""
+    largest = float(np.abs(vector).max())
+    if largest == 0.0 or not np.isfinite(largest):
+        raise SceneError(rule)
+    if largest <= 1.0 and abs(vector @ vector - 1.0) <= UNIT_TOLERANCE:
+        return vector.copy()
+    scaled = vector / largest
+    return scaled / np.linalg.norm(scaled)
 
 
 def path_value(path: Callable, t: float, what: str, quantity: str, shapes: tuple[tuple[int, ...], ...]) -> np.ndarray | None:

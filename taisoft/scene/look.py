@@ -79,10 +79,9 @@ class Light:
 
     def __post_init__(self):
         direction = checks.array(self.direction, "light: direction", ((3,),))
-        if not (length := float(np.linalg.norm(direction))) > 0.0:
-            raise SceneError("light: direction must not be zero")
+        direction = checks.unit(direction, "light: direction must not be zero")
         strength = checks.number(self.strength, "light: strength", minimum=0.0, maximum=10.0)
-        checks.store(self, direction=direction / length, strength=strength, colour=colour_of(self.colour, "light: colour"))
+        checks.store(self, direction=direction, strength=strength, colour=colour_of(self.colour, "light: colour"))
 
 
 @guarded_record("camera", "make a new Camera")

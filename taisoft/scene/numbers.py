@@ -40,11 +40,12 @@ def scene_numbers(scene: Scene) -> Numbers:
 
 
 def set_numbers(scene: Scene, numbers: Numbers) -> None:
-    """Set numbers by name, also friction and restitution of any pair, "contact.a.b.friction". Raises SceneError.
+    """Set numbers by name, also friction and restitution of any pair, "contact.a.b.friction", and looks. Raises SceneError.
 
-    One for a whole body replaces those by region and by tet, and that of a load its path.
+    Looks are colour and opacity of bodies and obstacles, such as "ball.colour", and "scene.background". A number for a whole body
+    replaces those by region and by tet, and that of a load its path.
     """
-    calls = {known: assign for known, _, assign in _entries(scene)}
+    calls = {known: assign for known, _, assign in _entries(scene)} | _looks(scene)
     for name, value in numbers.items():
         pair = re.fullmatch(r"contact\.(.+\..+)\.(friction|restitution)", name)
         if name in calls:
@@ -80,6 +81,15 @@ def _entries(scene: Scene) -> Iterator[Entry]:
         ends = f"{min(names)}.{max(names)}"
         for name, value in zip(("friction", "restitution"), pair):
             yield f"contact.{ends}.{name}", value, partial(_set_pair, scene, ends, name)
+
+
+def _looks(scene: Scene) -> dict[str, Callable]:
+    """Return the calls that set how a scene looks, by name; these are no numbers, so that checkpoints do not compare them."""
+    calls = {"scene.background": partial(setattr, scene, "background")}
+    for key in ("colour", "opacity"):
+        calls |= {f"{body.name}.{key}": partial(setattr, body, key) for body in scene.bodies}
+        calls |= {f"{one.name}.{key}": partial(_set_in, scene, "obstacles", k, key) for k, one in enumerate(scene.obstacles)}
+    return calls
 
 
 def _of_material(body: Body) -> Iterator[Entry]:
@@ -130,7 +140,8 @@ def _set_rigid(body: RigidBody, given: dict, name: str, value) -> None:
 def _set_in(scene: Scene, kind: str, k: int, name: str, value) -> None:
     """Replace a number of an obstacle or a connection, which are records in a list of the scene."""
     items = getattr(scene, kind)
-    value = checks.number(value, f"{items[k].name!r}: {name}", **LIMITS[name])
+    if name in LIMITS:
+        value = checks.number(value, f"{items[k].name!r}: {name}", **LIMITS[name])
     list.__setitem__(items, k, dataclasses.replace(items[k], **{name: value}))
 
 

@@ -23,7 +23,6 @@ from taisoft.scene.key_frames import KeyFrames, ShapePath
 from taisoft.scene.look import colour_or_none, opacity_of
 
 DEGENERATE = 1e-9  # a triangle has no area if its smallest height is below this times its longest edge
-UNIT_TOLERANCE = 8 * np.finfo(np.float64).eps  # squared lengths this close to 1 are kept, so normals read back unchanged
 MAKE_ANOTHER = "make another shape; an obstacle moves by its path"
 RIGID_TOLERANCE = 1e-6  # largest allowed entry of R^T R - I for a path's rotation R
 
@@ -71,7 +70,7 @@ class HalfSpace(Shape):
 
     def __post_init__(self):
         self._check("point", "normal")
-        checks.store(self, normal=_unit(self.normal, "half-space: normal must not be zero"))
+        checks.store(self, normal=checks.unit(self.normal, "half-space: normal must not be zero"))
 
     @property
     def pivot(self) -> np.ndarray:
@@ -139,7 +138,7 @@ class Capsule(Shape):
 
     def __post_init__(self):
         self._check("a", "b")
-        _unit(self.b - self.a, "capsule: a and b must not be the same point (that is a sphere)")
+        checks.unit(self.b - self.a, "capsule: a and b must not be the same point (that is a sphere)")
 
     @property
     def pivot(self) -> np.ndarray:
@@ -148,7 +147,7 @@ class Capsule(Shape):
 
     def frame(self) -> np.ndarray:
         """Return the rotation (3,3) with local x from a to b."""
-        return _axes(_unit(self.b - self.a, "capsule"), 0)
+        return _axes(checks.unit(self.b - self.a, "capsule"), 0)
 
     def size(self) -> np.ndarray:
         """Return (half length of the segment, radius, 0) [m]."""
@@ -191,17 +190,6 @@ class MeshObstacle(Shape):
     def surface(self) -> tuple[np.ndarray, np.ndarray]:
         """Return copies of the given arrays."""
         return self.vertices.copy(), self.triangles.copy()
-
-
-def _unit(vector: np.ndarray, rule: str) -> np.ndarray:
-    """Return the unit vector (3,). Raises SceneError with the rule for a zero or infinite vector."""
-    largest = float(np.abs(vector).max())
-    if largest == 0.0 or not np.isfinite(largest):
-        raise SceneError(rule)
-    if largest <= 1.0 and abs(vector @ vector - 1.0) <= UNIT_TOLERANCE:
-        return vector.copy()
-    scaled = vector / largest
-    return scaled / np.linalg.norm(scaled)
 
 
 def _axes(direction: np.ndarray, axis: int) -> np.ndarray:

@@ -294,7 +294,8 @@ def checked_surface(mesh: TetMesh | SurfaceMesh, what: str) -> SurfaceMesh:
     """Return the closed surface of a solid. Raises SceneError."""
     if isinstance(mesh, TetMesh):
         used, triangles = np.unique(mesh.surface, return_inverse=True)
-        return SurfaceMesh(mesh.vertices[used], triangles.reshape(-1, 3))
+        texture = {"uvs": mesh.surface_uvs, "subsets": mesh.surface_subsets}
+        return SurfaceMesh(mesh.vertices[used], triangles.reshape(-1, 3), **texture)
     if not isinstance(mesh, SurfaceMesh):
         raise SceneError(f"{what}: mesh must be a TetMesh or a SurfaceMesh, not {type(mesh).__name__}")
     faults = mesh.faults()

@@ -2,6 +2,8 @@
 
     up, gravity, allow_initial_overlap, contact_forces
     body_order                names of bodies and rigid bodies, in which nodes are numbered; by default bodies come first
+    background                a colour, or two at the top and the bottom of pictures; a COLOUR is "#rrggbb" or sRGB numbers (3,)
+    [[lights]]                Light                         [camera]               Camera
     [collision]               CollisionSettings
     [solver]                  arguments of Simulator, seconds, fps; "none" for Python's None
     [materials.NAME]          Material
@@ -16,7 +18,8 @@
     [rigid_bodies.NAME]       mesh (below, or a surface), and the arguments of Scene.add_rigid_body
     [[rigid_bodies.NAME.fix]] axes, rotations               [[rigid_bodies.NAME.move]] path (KeyFrames), axes
     [[rigid_bodies.NAME.force]] nodes (vertices; without them the centre of mass), force [N], or its KeyFrames
-    [obstacles.NAME]          shape and its arguments, friction, restitution, path (KeyFrames); or shape = "ground", height
+    [obstacles.NAME]          shape and its arguments, friction, restitution, path (KeyFrames), colour, opacity; or
+                              shape = "ground", height
     [[contacts]]              between = ["a", "b"], friction, restitution
     [springs.NAME]            a = ["body", POINT], b, and the other arguments of Scene.add_spring
     [tendons.NAME]            points = [["body", POINT], ...], force [N], or its KeyFrames
@@ -52,6 +55,7 @@ from taisoft.scene.obstacles import Box, Capsule, HalfSpace, MeshObstacle, Spher
 from taisoft.scene.scene import Scene
 from taisoft.scene.tables import Table, arguments_of, check_values, value_text
 from taisoft.scene.toml_connections import add_connections
+from taisoft.scene.toml_look import LOOK_KEYS, read_look
 from taisoft.scene.toml_meshes import kind_of, mesh_of, surface_of
 from taisoft.scene.toml_methods import call_methods
 from taisoft.scene.toml_rigid import add_rigid_body
@@ -71,6 +75,7 @@ ON_TRIANGLES = ("traction", "pressure", "cavity")  # methods that choose surface
 SCENE_KEYS = ("up", "gravity", "allow_initial_overlap", "contact_forces")  # attributes of a Scene at top level
 TOP_KEYS = [
     *SCENE_KEYS,
+    *LOOK_KEYS,
     "body_order",
     "collision",
     "solver",
@@ -84,6 +89,7 @@ TOP_KEYS = [
     "attachments",
 ]
 SURFACE_KEYS = ("friction", "restitution")
+OBSTACLE_KEYS = [*SURFACE_KEYS, "colour", "opacity"]
 NONE_TEXT = "none"
 
 
@@ -148,6 +154,7 @@ def _read(tables: Table, allow_outside: bool) -> tuple[Scene, dict]:
     obstacles = tables.named("obstacles")
     for name in obstacles.known:
         _add_obstacle(scene, name, obstacles)
+    read_look(scene, tables)
     _set_contacts(scene, tables)
     add_connections(scene, tables, selection)
     return scene, solver
@@ -277,7 +284,7 @@ def _add_obstacle(scene: Scene, name: str, obstacles: Table) -> None:
     made = {"shape": table.make(SHAPES[kind], f"{SHAPES[kind].word}: ", keys=keys), "name": name}
     if "path" in table:
         made["path"] = table.made("path", KeyFrames, "key frames: ")
-    table.make(scene.add_obstacle, f"obstacle {name!r}: ", "scene: ", "key frames: ", keys=list(SURFACE_KEYS), **made)
+    table.make(scene.add_obstacle, f"obstacle {name!r}: ", "scene: ", "key frames: ", keys=OBSTACLE_KEYS, **made)
 
 
 def _set_contacts(scene: Scene, tables: Table) -> None:

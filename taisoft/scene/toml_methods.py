@@ -33,7 +33,7 @@ def call_methods(
             extra = {}
             if items in known:
                 extra["where"] = selection(one, items) if items in one else None
-            if "path" in known:
+            if "path" in one:
                 extra["path"] = one.made("path", KeyFrames, "key frames: ")
             for argument in (key, *VARYING):
                 if argument in known and isinstance(one.values.get(argument), dict):  # a load that varies

@@ -7,6 +7,7 @@ from taisoft.mesh.tet_mesh import TetMesh
 from taisoft.scene.rigid import FRAME, RigidBody
 from taisoft.scene.scene import Scene
 from taisoft.scene.tables import Table, arguments_of
+from taisoft.scene.toml_look import look_of
 from taisoft.scene.toml_meshes import solid_of
 from taisoft.scene.toml_methods import call_methods, constraint_tables
 
@@ -37,7 +38,7 @@ def rigid_table(body: RigidBody, file_of: Callable[[TetMesh], dict], fields: Cal
     linear, angular = body.start_twist
     first = body.composition.first
     table |= {"density": body.density, "position": body.position, "velocity": linear, "angular_velocity": angular}
-    table |= {"friction": first.friction, "restitution": first.restitution}
+    table |= {"friction": first.friction, "restitution": first.restitution} | look_of(body)
     if body.given_young is not None:
         table["young"] = body.given_young
     foreign = "its position was set after its path with rotations: move it again"

@@ -30,6 +30,7 @@ from taisoft.scene.scene import Scene
 from taisoft.scene.tables import key_path, key_text, quote
 from taisoft.scene.toml import NONE_TEXT, SCENE_KEYS, SHAPES, SURFACE_KEYS
 from taisoft.scene.toml_connections import connection_tables
+from taisoft.scene.toml_look import look_of, look_tables
 from taisoft.scene.toml_methods import constraint_tables
 from taisoft.scene.toml_rigid import rigid_table, surface_table
 
@@ -107,6 +108,7 @@ def _document(scene: Scene, solver: dict, stem: str, meshes: dict[str, TetMesh])
     read = [body.name for body in (*elastic, *scene.rigid_bodies)]  # in the order in which `read_scene` adds them
     return {
         **{key: getattr(scene, key) for key in SCENE_KEYS},
+        **look_tables(scene, _fields),
         **({"body_order": order[: len(read)]} if read != order[: len(read)] else {}),
         "collision": _fields(scene.collision),
         "solver": _solver(solver),
@@ -155,7 +157,7 @@ def _body(body: Body, materials: dict[Material, str], stem: str, meshes: dict[st
     table |= {name: values for name, values in composition.by_tet.items() if name not in own} | (
         {"parameters": own} if own else {}
     )
-    table |= {key: getattr(body, key) for key in ("position", "velocity", "order", "collision")}
+    table |= {key: getattr(body, key) for key in ("position", "velocity", "order", "collision")} | look_of(body)
     # what was given, unless numbers have changed since so that it would be decided in another way
     table["dilatation"] = body.given_dilatation if body.dilatation == body.decided_dilatation else body.dilatation
     if body.quadrature_degree != QUADRATURE_DEGREES[body.order][0]:  # the default stays away, so that order can be edited
@@ -220,7 +222,7 @@ def _obstacle(obstacle: Obstacle) -> dict:
     kind = next((name for name, known in SHAPES.items() if known is type(shape)), None)
     if kind is None:
         raise SceneError(f"obstacle {obstacle.name!r}: a file cannot store a {type(shape).__name__}")
-    table = {"shape": kind} | _fields(shape) | {key: getattr(obstacle, key) for key in SURFACE_KEYS}
+    table = {"shape": kind} | _fields(shape) | {key: getattr(obstacle, key) for key in SURFACE_KEYS} | look_of(obstacle)
     if obstacle.given_path is None:
         return table
     if not isinstance(obstacle.given_path, ShapePath):

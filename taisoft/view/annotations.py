@@ -20,6 +20,7 @@ INSET = (50, 16, 18, 28)  # of the curves in a plot: left, right, below, above
 TITLE_SIZE, TEXT_SIZE, SMALL_SIZE, TICK_SIZE = 22, 15, 11, 10  # font sizes
 BAR = (220, 12)  # width and height of the colour bar
 INK, FAINT, GRID, PAPER = "#26292e", "#70747a", "#cdd0d4", "#fcfcfd"
+DARK = 100  # mean value of the picture's lower left corner below which text on it is light
 TICK_SPACE, MIN_SPAN, MAX_DECADES = 22, 1e-200, 12  # at least; values that span less count as constant; of a logarithmic axis
 ROW = 45  # characters of a title and names that fit beside each other; else names are in the plot, one below the other
 
@@ -46,6 +47,7 @@ class Annotations:
         """Return an annotated copy of a picture, uint8 (height, width, 3), of a state; index: frame number."""
         height, width = picture.shape[:2]
         self._clear((width, height))
+        self._on_dark = picture[-(height // 4) :, : width // 3 + 1].mean() < DARK
         if self._plots is not None and (plots := self._plots.visible()):
             self._draw_plots(plots, width * HEIGHT / height - MARGIN)
         bottom = MARGIN  # of what comes next
@@ -82,8 +84,9 @@ class Annotations:
         """Write text at a point, or at a fraction of another text `beside` it, shifted. halo: outline the letters."""
         from matplotlib.patheffects import withStroke
 
-        (ha, va), effects = align.split(), [withStroke(linewidth=3.0, foreground=PAPER)] if halo else []
-        style = {"size": max(size, HEIGHT / self._size[1]), "color": colour, "ha": ha, "va": va, "path_effects": effects}
+        ink, paper = (PAPER, INK) if self._on_dark and colour == INK and halo else (colour, PAPER)
+        (ha, va), effects = align.split(), [withStroke(linewidth=3.0, foreground=paper, alpha=0.8)] if halo else []
+        style = {"size": max(size, HEIGHT / self._size[1]), "color": ink, "ha": ha, "va": va, "path_effects": effects}
         options = {"annotation_clip": False, "parse_math": False}
         return self._axes.annotate(text, at, shift, beside or "data", "offset points", **style, **options)
 

@@ -7,10 +7,12 @@ an impact.
 
 Shading is computed per drawn vertex on the host, so that it is the same in pictures and in the window:
 colour = base * (hemisphere of sky and ground light + key light + fill light) * darkening at grazing angles, which emphasizes
-silhouettes. The lamps move with the camera, so that every view is lit alike.
+silhouettes. The lamps move with the camera, so that every view is lit alike. A scene's own lights replace both: each adds
+strength * its colour * max(0, -direction . n).
 """
 
 import math
+from collections.abc import Iterable
 
 import numpy as np
 
@@ -42,7 +44,7 @@ COLOURS = np.array([(0.27, 0.42, 0.80), (0.33, 0.70, 0.78), (0.72, 0.82, 0.45), 
 LAMPS = ((np.array([-0.35, 0.60, 0.72]), 0.72), (np.array([0.85, 0.15, 0.45]), 0.22))  # direction (right, up, back), strength
 SKY, GROUND = np.array([0.44, 0.46, 0.49]), np.array([0.26, 0.25, 0.24])
 EDGE_DARKENING = 0.22
-BACKGROUND_TOP, BACKGROUND_BOTTOM = np.array([0.95, 0.955, 0.96]), np.array([0.80, 0.81, 0.82])  # sRGB
+BACKGROUND = np.array([(0.95, 0.955, 0.96), (0.80, 0.81, 0.82)])  # sRGB, at the top and the bottom
 
 
 def checked_colour(kind: str) -> str:
@@ -63,7 +65,7 @@ class Colouring:
     def choose(self, kind: str) -> None:
         """Colour by another quantity, with a scale of its own."""
         self.kind = checked_colour(kind)
-        self._peak = self.span = 0.0
+        self._peak, self.span, self._is_fixed = 0.0, 0.0, False
 
     @property
     def scale(self) -> tuple[str, float, float]:
@@ -74,6 +76,17 @@ class Colouring:
         """Continue the `scale` of an earlier run, unless it was of another quantity."""
         if kind == self.kind:
             self._peak, self.span = float(peak), float(span)
+
+    def fix(self, states: Iterable[DrawnState]) -> None:
+        """Keep one scale from now on, that of the largest values in these states."""
+        if self.kind != "body":
+            self.span, self._is_fixed = round_up(max(MIN_SPAN[self.kind], *map(self._largest, states))), True
+
+    def _largest(self, state: DrawnState) -> float:
+        """Return the quantile of a state's values above the scale's lower end."""
+        above = state.values[self.kind].astype(np.float64) - self.low
+        finite = above[np.isfinite(above) & ((above > 0.0) | (self.kind not in POSITIVE))]
+        return float(np.quantile(finite, QUANTILE)) if len(finite) else 0.0
 
     def choose_next(self) -> None:
         """Colour by the next of UNITS; by the error only if that was the first choice, since it needs a run with error=True."""
@@ -89,10 +102,8 @@ class Colouring:
         if self.kind not in state.values:
             return self._surfaces.colours
         above = state.values[self.kind].astype(np.float64) - self.low
-        finite = above[np.isfinite(above) & ((above > 0.0) | (self.kind not in POSITIVE))]
-        value = float(np.quantile(finite, QUANTILE)) if len(finite) else 0.0
-        self._peak = max(value, DECAY * self._peak, MIN_SPAN[self.kind])
-        if self._peak > self.span or round_up(LOWER_MARGIN * self._peak) < self.span:
+        self._peak = max(self._largest(state), DECAY * self._peak, MIN_SPAN[self.kind])
+        if not self._is_fixed and (self._peak > self.span or round_up(LOWER_MARGIN * self._peak) < self.span):
             self.span = round_up(self._peak)
         colours = colours_of(np.nan_to_num(above / self.span))
         colours[np.isnan(above)] = UNKNOWN
@@ -129,13 +140,19 @@ def round_up(value: float) -> float:
     return next((k * power for k in (1.0, 2.0, 5.0) if k * power >= value * (1.0 - 1e-12)), 10.0 * power)
 
 
-def lit_colours(x: np.ndarray, normals: np.ndarray, base: np.ndarray, camera: Viewpoint) -> np.ndarray:
-    """Return shaded colours (n,3) in [0, 1] of vertices x (n,3) with unit normals (n,3) and base colours (n,3) for a camera."""
+def lit_colours(x: np.ndarray, normals: np.ndarray, base: np.ndarray, camera: Viewpoint, lights=None) -> np.ndarray:
+    """Return shaded colours (n,3) in [0, 1] of vertices x (n,3) with unit normals (n,3) and base colours (n,3) for a camera.
+
+    lights: of the scene, or None for the lamps of the camera.
+    """
     right, up, forward = camera.axes
     frame = np.array([right, up, -forward])
     light = GROUND + (SKY - GROUND) * (0.5 + 0.5 * normals @ UP[camera.up])[:, None]
-    for lamp, strength in LAMPS:
-        direction = (lamp / np.linalg.norm(lamp)) @ frame
+    if lights is None:
+        lamps = [((lamp / np.linalg.norm(lamp)) @ frame, strength) for lamp, strength in LAMPS]
+    else:
+        lamps = [(-one.direction, one.strength * one.colour) for one in lights]
+    for direction, strength in lamps:
         light = light + strength * np.clip(normals @ direction, 0.0, None)[:, None]
     to_eye = camera.position - x
     to_eye /= np.linalg.norm(to_eye, axis=1, keepdims=True)
@@ -143,9 +160,13 @@ def lit_colours(x: np.ndarray, normals: np.ndarray, base: np.ndarray, camera: Vi
     return np.clip(base * light * (1.0 - EDGE_DARKENING * grazing)[:, None], 0.0, 1.0)
 
 
-def background(size: tuple[int, int]) -> np.ndarray:
-    """Return a neutral vertical gradient, uint8 (height, width, 3), for size (width, height)."""
+def background(size: tuple[int, int], colours: np.ndarray | None = None) -> np.ndarray:
+    """Return a vertical gradient, uint8 (height, width, 3), for size (width, height).
+
+    colours: sRGB (2,3) at the top and the bottom; by default light grey.
+    """
     width, height = size
+    top, bottom = BACKGROUND if colours is None else colours
     mix = np.linspace(0.0, 1.0, height)[:, None] ** 1.5
-    column = BACKGROUND_TOP + (BACKGROUND_BOTTOM - BACKGROUND_TOP) * mix
+    column = top + (bottom - top) * mix
     return np.repeat(np.round(255 * column).astype(np.uint8)[:, None], width, axis=1)

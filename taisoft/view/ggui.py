@@ -74,7 +74,7 @@ def _future_panel_file() -> Path | None:
 
 
 class VertexBuffer:
-    """Vertices in the layout of Taichi's renderer, with x, normals and colours, each (n,3) and initially zero.
+    """Vertices in the layout of Taichi's renderer, with x, normals and colours (n,3), initially zero, and opacities (n,), 1.
 
     The renderer gets the address of the array, which lives as long as the buffer.
     """
@@ -83,6 +83,7 @@ class VertexBuffer:
         self._data = np.zeros((n, WIDTH), dtype=np.float32)
         self._data[:, ALPHA] = 1.0
         self.x, self.normals, self.colours = self._data[:, POSITION], self._data[:, NORMAL], self._data[:, COLOUR]
+        self.opacities = self._data[:, ALPHA]
 
     def __len__(self) -> int:
         return len(self._data)
@@ -119,8 +120,11 @@ class Canvas:
         self._vertices = VertexBuffer(self._n + n_decals[0])
         self._vertices.normals[:] = 0.0, 1.0, 0.0  # no effect: the colours are lit already
         self._indices = np.zeros((len(surfaces.triangles) + n_decals[1], 3), dtype=np.int32)
-        self._indices[: len(surfaces.triangles)] = surfaces.triangles
-        self._decals = self._indices[len(surfaces.triangles) :]  # unused triangles have no area
+        self._vertices.opacities[: self._n] = surfaces.opacities
+        transparent = self._vertices.opacities[surfaces.triangles[:, 0]] < 1.0
+        opaque, self._transparent = surfaces.triangles[~transparent], surfaces.triangles[transparent]
+        self._indices[: len(opaque)] = opaque
+        self._decals, self._last = np.split(self._indices[len(opaque) :], [n_decals[1]])  # unused triangles have no area
         self._ends = VertexBuffer(2 * n_segments)
         self._most = 0  # ends of lines drawn at once so far
         self.window = self._canvas = self._scene = None
@@ -154,6 +158,8 @@ class Canvas:
             rows = slice(self._n, self._n + len(decals[0]))
             self._vertices.x[rows], self._vertices.colours[rows] = decals[0] - camera.target, decals[1]
             self._decals[: len(decals[2])] = self._n + decals[2]
+        depths = (x[self._transparent] - camera.position).mean(axis=1) @ camera.forward
+        self._last[:] = self._transparent[np.argsort(-depths)]
         eye = ti.ui.Camera()
         eye.position(*(camera.position - camera.target))
         eye.lookat(*(camera.position - camera.target + camera.distance * camera.forward))

@@ -121,7 +121,7 @@ class InteractiveView(FramesOnPage):
                 continue
             x, faces = self._moved[0].get(number, surface.vertices.astype(np.float32)), surface.triangles.astype(np.uint32)
             side = "front" if isinstance(surface.obstacle.shape, HalfSpace) else "double"  # walls do not hide what they hold
-            grey = tuple(np.round(255 * obstacle_colour(surface.obstacle)).astype(int).tolist())
-            added = server.scene.add_mesh_simple(f"/obstacles/{number}", x, faces, color=grey, flat_shading=True, side=side)
+            colour = tuple(np.round(255 * obstacle_colour(surface.obstacle)).astype(int).tolist())
+            added = server.scene.add_mesh_simple(f"/obstacles/{number}", x, faces, color=colour, flat_shading=True, side=side)
             handles[number] = added
         return handles

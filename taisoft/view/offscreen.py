@@ -15,7 +15,7 @@ from taisoft.scene.look import Camera
 from taisoft.view.colouring import background
 from taisoft.view.raster import Raster
 from taisoft.view.scene_view import IN_PICTURES, SceneView
-from taisoft.view.shading import SAMPLES
+from taisoft.view.shading import N_ATTRIBUTES, SAMPLES
 from taisoft.view.shadow import Shadows
 
 SIZE = (1280, 720)
@@ -52,14 +52,15 @@ class Offscreen(SceneView):
         self.size = checked_size(size)
         super().__init__(scene, self.size, camera, colour, layers)
         self._samples = (self.size[0] * SAMPLES, self.size[1] * SAMPLES)
-        self._background = background(self.size)
+        self._background = background(self.size, self.scene.background)
         self._raster = Raster(self._samples)
         self._shadows = Shadows(self.scene, self.surfaces)
+        self._is_transparent = bool((self.surfaces.opacities < 1.0).any())
         self._drawn_at: float | None = None  # time of the latest picture [s]
         self._before: dict = {}  # what was kept before it
 
     def kept(self, time: float | None = None) -> dict:
-        """Return, as plain data, what pictures from time [s] on depend on: distance of the camera [m], scales, recent maxima.
+        """Return, as plain data, what pictures from time [s] on depend on: camera, scales, recent maxima.
 
         A picture already drawn at that time does not count, since a resumed run draws it again; without a time all do.
         """
@@ -68,7 +69,8 @@ class Offscreen(SceneView):
     def resume(self, kept: dict) -> None:
         """Continue from what an earlier run kept; entries that are missing start anew."""
         if kept.get("camera") is not None:
-            self.camera = replace(self.camera, distance=float(kept["camera"]))
+            *target, distance = kept["camera"]
+            self.camera = replace(self.camera, target=np.array(target), distance=distance)
         self.colouring.resume(*kept.get("scale", self.colouring.scale))
         self.layers.peak = float(kept.get("impulse", 0.0))
         self.layers.connections.peak = float(kept.get("tension", 0.0))
@@ -77,7 +79,7 @@ class Offscreen(SceneView):
     def _present(self) -> dict:
         layers = self.layers
         peaks = {"impulse": layers.peak, "tension": layers.connections.peak, "pressure": layers.pressures.peak}
-        return {"camera": self.camera.distance, "scale": list(self.colouring.scale)} | peaks
+        return {"camera": [*self.camera.target.tolist(), self.camera.distance], "scale": list(self.colouring.scale)} | peaks
 
     def image(self, sim) -> np.ndarray:
         """Return a picture of a `DrawnState`, or of a simulator's present state, uint8 (height, width, 3), first row on top.
@@ -94,8 +96,11 @@ class Offscreen(SceneView):
         runtime = open_runtime(*(open_kind() or ("cpu", "f32")), owner="a picture renderer")
         try:
             maps, texels = self._shadows.draw(x, state.poses)
-            drawn = self._triangles(x, np.column_stack([colours, texels]), lines)
-            self._raster.draw(*drawn, self.camera.clipping[0], maps, picture)
+            attributes = np.column_stack([colours, texels, self.surfaces.opacities])
+            points, triangles, attributes = self._triangles(x, attributes, lines)
+            opacities = attributes[triangles[:, 0], N_ATTRIBUTES] if self._is_transparent else None
+            drawn = points, triangles, attributes[:, :N_ATTRIBUTES]
+            self._raster.draw(*drawn, self.camera.clipping[0], maps, picture, opacities)
         finally:
             runtime.close()
         return picture
@@ -108,7 +113,7 @@ class Offscreen(SceneView):
         if len(ends) == 0:
             return points, triangles, attributes
         corners, bands = stroke(self.camera.project(ends, self._samples), SAMPLES * LINE_WIDTH)
-        unshaded = np.zeros((len(corners), 3)) - (0.0, 0.0, 1.0)
+        unshaded = np.tile([0.0, 0.0, -1.0, 1.0], (len(corners), 1))  # and opaque
         band_attributes = np.column_stack([np.repeat(line_colours, 2, axis=0), unshaded])
         triangles = np.concatenate([triangles, len(x) + bands])
         return np.concatenate([points, corners]), triangles, np.concatenate([attributes, band_attributes])

@@ -6,6 +6,9 @@ samples of a row between its edges. Two triangles that share an edge compute its
 they leave no gap. The z-buffer holds keys: the bits of 1/depth, which like attribute/depth is linear in the picture, with the
 triangle's number in the tile's list in the lowest ones. So the larger of two keys, as integers, is that of the nearer triangle.
 
+Transparent triangles are drawn by depth peeling (Everitt 2001) from front to back: the next layer of a sample is its largest key
+below the last one's, so that surfaces may intersect, and come in any order.
+
 All numbers are f64 in every runtime: pictures do not depend on the precision of the simulation. Arrays are NumPy's; on CUDA
 Taichi copies them for every launch.
 """
@@ -15,13 +18,15 @@ import taichi as ti
 
 from taisoft.backend.runtime import kernel
 from taisoft.errors import OutputError
-from taisoft.view.shading import MAP, ORDINALS, SAMPLES, TILE, resolve
+from taisoft.view.shading import MAP, ORDINALS, SAMPLES, TILE, WIDTH, colour_at, resolve
 
 MAX_COORDINATE = 1e6  # samples; triangles beyond are skipped, and `Viewpoint.clipped` leaves none
 MIN_AREA = 1e-10  # samples^2; twice that of a triangle that is drawn
 FLAT = 1e-12  # samples; an edge that rises less bounds no row
 UNBOUNDED = 1e30  # samples, where an edge does not bound a row
 MAX_LISTED = 2**31 - 1
+NEAREST = 2**63 - 1  # key in front of all others
+LEAST_LIGHT = 1.0 / 512.0  # fraction of the light behind a sample's layers below which no further one is drawn
 ARRAY = ti.types.ndarray()
 
 
@@ -43,15 +48,16 @@ class Raster:
         near: float,
         shadows: np.ndarray,
         picture: np.ndarray,
+        opacities: np.ndarray | None = None,
     ) -> None:
         """Draw triangles over a picture, uint8 (height, width, 3) in pixels of SAMPLES x SAMPLES samples.
 
         points: (n,3), position in samples from the upper left corner, and depth; triangles: (t,3); attributes: (n,N_ATTRIBUTES)
         of the points, see `shading`. Triangles that reach nearer than `near` or beyond MAX_COORDINATE, or are not finite, are
         skipped; both sides are drawn. Of triangles at the same depth the last one is in front. shadows: (maps, v, u), the
-        fraction of light that is missing. Raises OutputError for too many triangles.
+        fraction of light that is missing. opacities: (t,), None if all are 1. Raises OutputError for too many triangles.
         """
-        self._draw(points, triangles, attributes, near, shadows, picture, None)
+        self._draw(points, triangles, attributes, near, shadows, picture, None, opacities)
 
     def inverse_depths(self, points: np.ndarray, triangles: np.ndarray, near: float = 0.0) -> np.ndarray:
         """Return 1/depth of all samples (height, width), 0 where no triangle is; arguments as for `draw`."""
@@ -59,7 +65,7 @@ class Raster:
         self._draw(points, triangles, None, near, np.zeros((1, 2, 2)), None, depths)
         return depths
 
-    def _draw(self, points, triangles, attributes, near, shadows, picture, depths) -> None:
+    def _draw(self, points, triangles, attributes, near, shadows, picture, depths, opacities=None) -> None:
         n, n_attributes = len(triangles), 0 if attributes is None else attributes.shape[1]
         if n == 0:
             return
@@ -78,9 +84,13 @@ class Raster:
             raise OutputError(f"a picture cannot show {n} triangles of this size: they cover too many tiles of the picture")
         if self._ends[-1] > len(self._listed):
             self._listed = np.empty(min(int(1.25 * self._ends[-1]), MAX_LISTED), dtype=np.int32)
+        enlist(n, self._columns, self._boxes, self._ends, self._listed)
+        if opacities is not None:
+            peel(self.size[0], self._columns, *of_triangles, self._listed, opacities, shadows, picture)
+            return
         has_picture, has_depths = picture is not None, depths is not None
         images = picture if has_picture else np.zeros((1, 1, 3), np.uint8), depths if has_depths else np.zeros((1, 1))
-        sizes = n, self.size[0], self._columns, has_picture, has_depths
+        sizes = self.size[0], self._columns, has_picture, has_depths
         draw(*sizes, *of_triangles, self._listed, shadows, *images)
 
 
@@ -170,8 +180,20 @@ def set_up(
 
 
 @kernel(cse=False)
+def enlist(n: ti.i32, columns: ti.i32, boxes: ARRAY, ends: ARRAY, listed: ARRAY):
+    """List the first n triangles by tile. ends: a list's beginning becomes its end, which is the next one's beginning."""
+    ti.loop_config(serialize=True)
+    for t in range(n):
+        if boxes[t, 2] <= boxes[t, 3]:
+            for row in range(boxes[t, 2] // TILE, boxes[t, 3] // TILE + 1):
+                for column in range(boxes[t, 0], boxes[t, 1] + 1):
+                    tile = row * columns + column
+                    listed[ti.i32(ends[tile])] = t
+                    ends[tile] = ends[tile] + 1
+
+
+@kernel(cse=False)
 def draw(
-    n: ti.i32,
     width: ti.i32,
     columns: ti.i32,
     has_picture: ti.i32,
@@ -185,20 +207,10 @@ def draw(
     picture: ARRAY,
     depths: ARRAY,
 ):
-    """List the first n triangles by tile, and draw tile by tile: colours into picture, and 1/depth into depths.
+    """Draw tile by tile: colours into picture, and 1/depth into depths.
 
-    ends: the beginning of every tile's list becomes its end, which is the next one's beginning. A tile is drawn by pairs of rows,
-    whose keys are local vectors: its z-buffer needs no memory.
+    A tile is drawn by pairs of rows, whose keys are local vectors: its z-buffer needs no memory.
     """
-    ti.loop_config(serialize=True)
-    for t in range(n):
-        if boxes[t, 2] <= boxes[t, 3]:
-            for row in range(boxes[t, 2] // TILE, boxes[t, 3] // TILE + 1):
-                for column in range(boxes[t, 0], boxes[t, 1] + 1):
-                    tile = row * columns + column
-                    listed[ti.i32(ends[tile])] = t
-                    ends[tile] = ends[tile] + 1
-
     for tile in range(ends.shape[0] - 1):
         first, last = 0, ti.i32(ends[tile])
         if tile > 0:
@@ -212,8 +224,8 @@ def draw(
                 lower = ti.Vector([ti.i64(0)] * TILE)
                 for index in range(first, last):
                     t = listed[index]
-                    cover(upper, t, index - first, row, left, right, edges, planes, boxes)
-                    cover(lower, t, index - first, row + 1, left, right, edges, planes, boxes)
+                    cover(upper, upper, False, t, index - first, row, left, right, edges, planes, boxes)
+                    cover(lower, lower, False, t, index - first, row + 1, left, right, edges, planes, boxes)
                 if has_picture and row // SAMPLES < picture.shape[0]:
                     resolve(upper, lower, first, row // SAMPLES, left // SAMPLES, planes, boxes, listed, shadows, picture)
                 if has_depths:
@@ -225,18 +237,89 @@ def draw(
                                 depths[row + 1, left + column] = ti.bit_cast(lower[column] & ~ORDINALS, ti.f64)
 
 
+@kernel(cse=False)
+def peel(
+    width: ti.i32,
+    columns: ti.i32,
+    edges: ARRAY,
+    planes: ARRAY,
+    boxes: ARRAY,
+    ends: ARRAY,
+    listed: ARRAY,
+    opacities: ARRAY,
+    shadows: ARRAY,
+    picture: ARRAY,
+):
+    """Draw tile by tile as `draw` does, with opacities: the layers of every sample from front to back."""
+    for tile in range(ends.shape[0] - 1):
+        first, last = 0, ti.i32(ends[tile])
+        if tile > 0:
+            first = ti.i32(ends[tile - 1])
+        left, right = tile % columns * TILE, ti.min(tile % columns * TILE + TILE, width) - 1
+        top = tile // columns * WIDTH  # in pixels
+        bottom = ti.select(first < last, ti.min(top + WIDTH, picture.shape[0]), top)
+        for row in range(top, bottom):
+            total = ti.Vector([ti.f64(0.0)] * (3 * WIDTH))
+            for line in range(SAMPLES * row, SAMPLES * row + SAMPLES):
+                behind = ti.Vector([ti.f64(1.0)] * TILE)  # fraction of the light behind that passes the layers so far
+                limits = ti.Vector([ti.i64(NEAREST)] * TILE)
+                goes_on = True
+                while goes_on:
+                    goes_on = False
+                    keys = ti.Vector([ti.i64(0)] * TILE)
+                    for index in range(first, last):
+                        cover(keys, limits, True, listed[index], index - first, line, left, right, edges, planes, boxes)
+                    for column in range(TILE):
+                        if keys[column] > 0:
+                            t = listed[first + ti.i32(keys[column] & ORDINALS)]
+                            colour = colour_at(t, left + column + 0.5, line + 0.5, planes, boxes, shadows)
+                            share = behind[column] * opacities[t]
+                            for channel in ti.static(range(3)):
+                                total[column // SAMPLES * 3 + channel] += share * colour[channel]
+                            behind[column] -= share
+                        limits[column] = ti.select(behind[column] > LEAST_LIGHT, keys[column], ti.i64(0))
+                        goes_on = goes_on or limits[column] > 0
+                for column in range(right - left + 1):
+                    for channel in ti.static(range(3)):
+                        under = ti.f64(picture[row, (left + column) // SAMPLES, channel])
+                        total[column // SAMPLES * 3 + channel] += behind[column] * under
+            for column in range((right - left + 1) // SAMPLES):
+                for channel in ti.static(range(3)):
+                    mean = total[3 * column + channel] / SAMPLES**2
+                    picture[row, left // SAMPLES + column, channel] = ti.u8(ti.i32(mean + 0.5))
+
+
 @ti.func
-def cover(keys: ti.template(), t, ordinal, row, left, right, edges: ti.template(), planes: ti.template(), boxes: ti.template()):
-    """Draw triangle t, number `ordinal` of its tile, into the keys of a row of samples; a key of 0 is the background."""
+def cover(
+    keys: ti.template(),
+    limits: ti.template(),
+    peels: ti.template(),
+    t,
+    ordinal,
+    row,
+    left,
+    right,
+    edges: ti.template(),
+    planes: ti.template(),
+    boxes: ti.template(),
+):
+    """Draw triangle t, number `ordinal` of its tile, into the keys of a row of samples; a key of 0 is the background.
+
+    peels: only keys below the limits count, and a sample on an edge between two triangles belongs to one of them.
+    """
     if boxes[t, 2] <= row and row <= boxes[t, 3]:
         y = ti.f64(row) + 0.5
         begin = ti.max(edges[t, 3] + edges[t, 0] * y, ti.max(edges[t, 4] + edges[t, 1] * y, edges[t, 5] + edges[t, 2] * y))
         end = ti.min(edges[t, 6] + edges[t, 0] * y, ti.min(edges[t, 7] + edges[t, 1] * y, edges[t, 8] + edges[t, 2] * y))
+        if ti.static(peels):
+            end = ti.ceil(ti.min(end - 0.5, right + 1.0)) - 0.5
         begin, end = ti.ceil(ti.max(begin - 0.5, ti.f64(left))), ti.floor(ti.min(end - 0.5, ti.f64(right)))
         if begin <= end:
             a, at_row = planes[t, 0], planes[t, 0] * (left + 0.5) + planes[t, 1] * y + planes[t, 2]
             number, first, last = ti.i64(ordinal), ti.i32(begin) - left, ti.i32(end) - left
             for column in range(TILE):  # all of the row: the compiler makes SIMD of a loop of fixed length
                 key = ti.bit_cast(a * ti.f64(column) + at_row, ti.i64) & ~ORDINALS | number
+                if ti.static(peels):
+                    key = ti.select(key < limits[column], key, ti.i64(0))
                 key = ti.select(column >= first and column <= last, key, ti.i64(0))
                 keys[column] = ti.max(keys[column], key)

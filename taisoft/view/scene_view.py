@@ -1,8 +1,6 @@
 """What pictures and the window show of a scene: triangles of surfaces, lines over them, and the camera that follows the bodies.
 
-A drawn vertex belongs to one node and one smoothing group: the triangles around that node that are connected over edges
-bent by less than CREASE at rest. Its normal is the area-weighted mean over that group. So a ball looks round and a box
-keeps its edges, in every deformed state. A second-order face is drawn as four flat triangles between its six nodes.
+Normals are those of `taisoft/output/smoothing.py`. A second-order face is drawn as four flat triangles between its six nodes.
 Obstacles are drawn with back-face culling, so that a bin's walls show only their inner sides.
 
 Lines are wireframes of the bodies' surfaces, contacts with normals and impulses, arrows of tractions and pressures, and
@@ -15,8 +13,9 @@ from dataclasses import replace
 import numpy as np
 
 from taisoft.errors import OutputError
-from taisoft.mesh.topology import linked_groups, triangle_edges
+from taisoft.mesh.topology import triangle_edges
 from taisoft.output.appearance import ObstacleSurface, ShownBodies, body_colours, obstacle_colour, obstacle_surfaces, subdivide
+from taisoft.output.smoothing import smoothing_groups, unit, vertex_normals
 from taisoft.output.viewpoint import MAX_WIDENING, WHOLE, Viewpoint, camera_viewpoint
 from taisoft.scene.look import Camera
 from taisoft.scene.obstacles import HalfSpace
@@ -26,7 +25,6 @@ from taisoft.view.drawn import DrawnBody, DrawnScene, DrawnState
 from taisoft.view.ground import Square, finite_points
 from taisoft.view.sampling import MAX_CONTACTS, Sampler
 
-CREASE = 35.0  # [deg] between the normals of neighbouring triangles at rest
 MARKER_COLOUR = np.array([0.20, 0.22, 0.26])  # sRGB
 MARKER_SIZE = 0.16  # radius in units of the mean edge length of the body's surface
 
@@ -61,7 +59,7 @@ class SceneView:
         self._widest = 0.0  # largest automatic distance [m]; 0: the camera does not move back
         if self.camera is None:
             self.look_from(size)
-        self.surfaces = Surfaces(self.scene)
+        self.surfaces, self._lights = Surfaces(self.scene), self.scene.lights
         self.layers = Layers(self.scene, layers)
         self.colouring = Colouring(self.surfaces, colour)
 
@@ -90,7 +88,7 @@ class SceneView:
             self.camera = camera_viewpoint(self.scene, state.time, state.x)
         self.camera = self.camera.widened(bodies[0], size, self._widest, self._free(size))
         x, normals = self.surfaces.with_obstacles(bodies, state, self.camera.position)
-        colours = lit_colours(x, normals, self.colouring.base(state), self.camera)
+        colours = lit_colours(x, normals, self.colouring.base(state), self.camera, self._lights)
         return x, colours, self.layers.lines(state, self.camera)
 
 
@@ -98,7 +96,7 @@ class Surfaces:
     """All drawn surfaces as one triangle mesh of fixed topology and colours.
 
     scene: a Scene, which is read once, or what is drawn of one. triangles: int32 (t,3) of drawn vertices, and body_triangles
-    those of bodies without markers; colours: float (n,3), unshaded sRGB.
+    those of bodies without markers; colours: float (n,3), unshaded sRGB; opacities: (n,).
     """
 
     def __init__(self, scene):
@@ -117,6 +115,8 @@ class Surfaces:
         firsts = np.cumsum([0] + [len(part.colours) for part in parts])  # drawn vertex of each part
         self.triangles = np.concatenate([part.triangles + n for part, n in zip(parts, firsts)]).astype(np.int32)
         self.colours = np.concatenate([part.colours for part in parts])
+        opacities = [one.opacity for one in (*scene.bodies, *scene.obstacles)]
+        self.opacities = np.repeat(opacities, np.diff(firsts))
         self.n_of_bodies = int(firsts[len(self._bodies)])  # drawn vertices of bodies, which come first
         self.body_triangles = np.concatenate([part.own_triangles + n for part, n in zip(self._bodies, firsts)]).astype(np.int32)
         ranges = [slice(*ends) for ends in zip(firsts[len(self._bodies) :], firsts[len(self._bodies) + 1 :])]
@@ -268,52 +268,6 @@ class _RigidSurface:
         return corners.reshape(-1, 3), normals.reshape(-1, 3)
 
 
-def smoothing_groups(rest: np.ndarray, surface: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Split surface nodes at sharp edges.
-
-    rest: (n,3); surface: (t,3) node ids. Returns nodes (d,), the node of each drawn vertex, and corners (t,3), the drawn
-    vertex at each triangle's corner: nodes[corners] == surface.
-    """
-    t = len(surface)
-    a, b, c = (rest[surface[:, k]] for k in range(3))
-    normals = _unit(np.cross(b - a, c - a))
-    # sort half-edges by their vertex pair: neighbours in the list share an edge
-    ends = np.sort(np.stack([surface, np.roll(surface, -1, axis=1)], axis=2).reshape(-1, 2), axis=1)
-    order = np.lexsort((ends[:, 1], ends[:, 0]))
-    same = np.flatnonzero((ends[order[1:]] == ends[order[:-1]]).all(axis=1))
-    first, second = order[same], order[same + 1]
-    smooth = np.einsum("ij,ij->i", normals[first // 3], normals[second // 3]) > np.cos(np.radians(CREASE))
-    first, second = first[smooth], second[smooth]
-    # corner 3*t+k is vertex k of triangle t; half-edge 3*t+k runs from corner k to the next one
-    corner_vertex = surface.ravel()
-    links = []
-    for end in (first, first // 3 * 3 + (first + 1) % 3):
-        for other in (second, second // 3 * 3 + (second + 1) % 3):
-            same_node = corner_vertex[end] == corner_vertex[other]
-            links.append(np.stack([end[same_node], other[same_node]]))
-    i, j = np.concatenate(links, axis=1)
-    n_drawn, group = linked_groups(i, j, 3 * t)
-    nodes = np.empty(n_drawn, dtype=np.int64)
-    nodes[group] = corner_vertex
-    return nodes, group.reshape(t, 3)
-
-
-def vertex_normals(x: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    """Return unit normals (n,3): per vertex the area-weighted mean over its triangles (t,3), or zero if they cancel."""
-    a, b, c = (x[triangles[:, k]] for k in range(3))
-    (u0, u1, u2), (v0, v1, v2) = (b - a).T, (c - a).T
-    areas = np.stack([u1 * v2 - u2 * v1, u2 * v0 - u0 * v2, u0 * v1 - u1 * v0], axis=1)  # np.cross takes twice as long
-    total = np.empty_like(x)
-    for axis in range(3):
-        total[:, axis] = np.bincount(triangles.ravel(), np.repeat(areas[:, axis], 3), minlength=len(x))
-    return _unit(total)
-
-
-def _unit(vectors: np.ndarray) -> np.ndarray:
-    length = np.linalg.norm(vectors, axis=1, keepdims=True)
-    return vectors / np.where(length > 0, length, 1.0)
-
-
 def _coarse_ball() -> tuple[np.ndarray, np.ndarray]:
     """Return a coarse unit sphere: an octahedron subdivided twice, 66 vertices (n,3) and 128 triangles (t,3)."""
     points = np.concatenate([np.eye(3), -np.eye(3)])
@@ -322,7 +276,7 @@ def _coarse_ball() -> tuple[np.ndarray, np.ndarray]:
     triangles = np.array([f if sum(k > 2 for k in f) % 2 == 0 else f[::-1] for f in faces])
     for _ in range(2):
         points, triangles = subdivide(points, triangles)
-        points = _unit(points)
+        points = unit(points)
     return points, triangles
 
 

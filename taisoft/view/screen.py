@@ -12,7 +12,7 @@ from taisoft.files import write_bytes
 from taisoft.output.files import make_folder
 from taisoft.output.frames import png_bytes
 from taisoft.output.viewpoint import MAX_WIDENING, Viewpoint
-from taisoft.view.colouring import BACKGROUND_TOP
+from taisoft.view.colouring import BACKGROUND
 from taisoft.view.drawn import DrawnScene, DrawnState
 from taisoft.view.ggui import Canvas
 from taisoft.view.keys import ACTIONS
@@ -63,6 +63,7 @@ class Screen(SceneView):
         self._note = Note()  # about pictures and camera
         self._messages: list[str] = []  # those shown
         self._shadow_mesh = ShadowMesh(scene, self.surfaces)
+        self._background = BACKGROUND if scene.background is None else scene.background
         n_segments, n_decals = self.layers.n_segments + 1, self._shadow_mesh.size
         self._canvas = Canvas(self.surfaces, SIZE, visible=True, n_segments=n_segments, n_decals=n_decals)
 
@@ -91,7 +92,7 @@ class Screen(SceneView):
             ends = np.concatenate([dragged, ends])
             line_colours = np.concatenate([np.tile(DRAG_COLOUR, (2, 1)), line_colours])
         shadows = self._shadow_mesh.draw(x, drawn.poses, self.camera) if self.layers.shown["shadows"] else None
-        self._canvas.draw(x, colours, self.camera, tuple(BACKGROUND_TOP), (ends, line_colours), shadows)
+        self._canvas.draw(x, colours, self.camera, tuple(self._background[0]), (ends, line_colours), shadows)
         self._take_picture(size)
         # lines above the sliders must be constant in number: a transient line would move the sliders under the cursor
         with window.get_gui().sub_window("taisoft", *self._panel_rectangle) as gui:

@@ -1,8 +1,9 @@
 """Soft shadows of the bodies on half-spaces, as maps of the fraction of light that is missing.
 
-Light falls straight down. The bodies' triangles are drawn into a map of the half-space's boundary, each point with
-exp(-height / FADE), so that a shadow is darkest where a body touches. The map is then blurred. A map covers only the shadows, so
-that its texels are small. Obstacles cast no shadow, and receive none unless they are half-spaces.
+Light falls along the first of the scene's lights that shines down steeply enough, else straight down. The bodies' triangles are
+drawn into a map of the half-space's boundary, each point with opacity * exp(-height / FADE), so that a shadow is darkest where a
+body touches. The map is then blurred. A map covers only the shadows, so that its texels are small. Obstacles cast no shadow, and
+receive none unless they are half-spaces.
 """
 
 from dataclasses import dataclass
@@ -41,7 +42,8 @@ class Shadows:
     """Shadow maps of the half-spaces of `Surfaces`. scene: a `DrawnScene`."""
 
     def __init__(self, scene, surfaces):
-        self._surfaces, self._up = surfaces, UP[scene.up]
+        steep = [-one.direction for one in scene.lights or () if -one.direction @ UP[scene.up] >= MIN_SLOPE]
+        self._surfaces, self._up = surfaces, steep[0] if steep else UP[scene.up]  # towards the light
         self._size = scene.size
         self._raster: Raster | None = None  # made for the first half-space
 
@@ -87,7 +89,7 @@ class Shadows:
         if self._raster is None:
             self._raster = Raster((TEXELS, TEXELS))
         with np.errstate(invalid="ignore"):  # triangles with nodes that are not finite are skipped
-            depth = np.exp(np.clip(height / (FADE * self._size), 0.0, 50.0))
+            depth = np.exp(np.clip(height / (FADE * self._size), 0.0, 50.0)) / self._surfaces.opacities[: len(height)]
         points = np.column_stack([(shadow - low) / texel, depth])
         darkness = STRENGTH * self._raster.inverse_depths(points, self._surfaces.body_triangles)
         return blurred(darkness, sigma / texel[::-1]), low, texel, square

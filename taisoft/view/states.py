@@ -5,9 +5,7 @@
 """
 
 import json
-from collections import deque
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -17,6 +15,7 @@ import numpy as np
 from taisoft.errors import OutputError, TaisoftError, reason
 from taisoft.files import replacing
 from taisoft.nested import join_arrays, part_arrays
+from taisoft.output.background import BackgroundWriter
 from taisoft.output.files import make_folder
 from taisoft.scene.checks import index
 from taisoft.scene.look import Camera, colour_of, opacity_of
@@ -27,7 +26,6 @@ from taisoft.view.sampling import Sampler
 from taisoft.view.scene_view import LAYERS
 
 STATES_NAME, SCENE_NAME = "states", "scene.npz"
-WAITING = 8  # states that are not written yet
 FORMAT = 1  # increment it with every change of a file's content
 KEPT = ("stress", "speed")  # quantities that a run keeps by default
 DISPLACEMENT, VALUES = "displacement", "values"  # arrays over the nodes; the latter followed by a quantity's name
@@ -43,7 +41,7 @@ class StateWriter:
     def __init__(self, folder: str | Path, sampler: Sampler, kinds: Sequence[str] | None, members: Sequence, shown: tuple):
         self._sampler, self._members, self._folder = sampler, members, None if kinds is None else Path(folder) / STATES_NAME
         self._layers, self._kinds = (shown[0] if kinds is None else LAYERS), list(dict.fromkeys([*(kinds or ()), shown[1]]))
-        self._pool, self._pending = ThreadPoolExecutor(1, "states"), deque()
+        self._writer = BackgroundWriter()
         if self._folder is not None:
             _write(make_folder(self._folder) / SCENE_NAME, sampler.drawn.plain(), {})
 
@@ -53,27 +51,20 @@ class StateWriter:
         state = self._sampler.state(sim, layers, self._kinds)
         if self._folder is not None:
             values = {f"{VALUES}/{kind}": one for kind, one in state.values.items()}
-            path, arrays = self._folder / f"{index:05d}.npz", {DISPLACEMENT: state.displacement} | values
-            self._pending.append(self._pool.submit(_write, path, state.plain(), arrays))
-            self._wait(WAITING)
+            arrays = {DISPLACEMENT: state.displacement} | values
+            self._writer.write(self._folder / f"{index:05d}.npz", _write, state.plain(), arrays)
         for member in self._members:
             member.frame(state, index)
 
-    def _wait(self, most: int) -> None:
-        """Wait until at most so many files are not written yet. Raises OutputError."""
-        while len(self._pending) > most:
-            self._pending.popleft().result()
-
     def flush(self) -> None:
         """Wait until all states are written. Raises OutputError."""
-        self._wait(0)
+        self._writer.flush()
 
     def close(self) -> None:
         """Write the states that wait, and close the members; a second call does nothing. Raises OutputError."""
         with ExitStack() as stack:
-            for close in (self._pool.shutdown, *(member.close for member in self._members)):
-                stack.callback(close)
-            self.flush()
+            for one in (self._writer, *self._members):
+                stack.callback(one.close)
 
 
 class StoredRun:

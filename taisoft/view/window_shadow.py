@@ -7,7 +7,6 @@ import numpy as np
 from scipy.spatial import ConvexHull
 
 from taisoft.mesh.placing import UP
-from taisoft.output.appearance import OBSTACLE_COLOUR
 from taisoft.output.viewpoint import Viewpoint
 from taisoft.scene.obstacles import HalfSpace
 from taisoft.view.colouring import lit_colours
@@ -22,7 +21,7 @@ class ShadowMesh:
     """Meshes of the shadows on the half-spaces of a scene. size: their largest numbers of vertices and triangles."""
 
     def __init__(self, scene, surfaces):
-        self._shadows = Shadows(scene, surfaces)
+        self._shadows, self._surfaces, self._lights = Shadows(scene, surfaces), surfaces, scene.lights
         grounds = [o for o in scene.obstacles if isinstance(o.shape, HalfSpace)]
         n_maps = sum(o.path is not None or o.shape.normal @ UP[scene.up] >= MIN_SLOPE for o in grounds)
         side = TEXELS // EVERY
@@ -40,14 +39,14 @@ class ShadowMesh:
         """
         points, colours, triangles = [], [], []
         for one in self._shadows.maps(x, poses):
-            if (camera.position - one.origin) @ one.axes[2] <= 0.0:
+            if (camera.position - one.origin) @ one.axes[2] <= 0.0 or self._surfaces.opacities[one.vertices.start] < 1.0:
                 continue
             own = one.origin + _inside(one.square, self._texels * one.texel + one.low) @ one.axes[:2]
             side = TEXELS // EVERY
             darkness = one.darkness.reshape(side, EVERY, side, EVERY).mean(axis=(1, 3)).reshape(-1, 1)
             triangles.append(self._triangles[darkness[self._triangles, 0].max(axis=1) > FAINT] + len(points) * len(own))
-            normals, base = np.tile(one.axes[2], (len(own), 1)), np.tile(OBSTACLE_COLOUR, (len(own), 1))
-            colours.append(lit_colours(own, normals, base, camera) * (1.0 - darkness))
+            normals, base = (np.tile(row, (len(own), 1)) for row in (one.axes[2], self._surfaces.colours[one.vertices.start]))
+            colours.append(lit_colours(own, normals, base, camera, self._lights) * (1.0 - darkness))
             points.append(camera.nearer(own, LIFT))
         if not points:
             return None

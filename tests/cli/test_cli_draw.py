@@ -79,8 +79,12 @@ def test_the_run_itself_stays(finished, tmp_path, capsys):
 
 
 def test_a_run_that_keeps_nothing(beam, tmp_path, capsys):
-    assert run(beam, "--out", tmp_path / "out", "--keep", "none", "--no-usd", "--no-frames") == 0
-    assert not (tmp_path / "out/states").exists()
+    """It removes what was drawn of the earlier one."""
+    (tmp_path / "out/drawn/frames").mkdir(parents=True)
+    (tmp_path / "out/drawn/frames/00000.png").touch()
+    assert run(beam, "--out", tmp_path / "out") == 3 and "drawn/frames/" in capsys.readouterr().err
+    assert run(beam, "--out", tmp_path / "out", "--keep", "none", "--no-usd", "--no-frames", "--overwrite") == 0
+    assert not (tmp_path / "out/states").exists() and not any((tmp_path / "out/drawn/frames").iterdir())
     capsys.readouterr()
     for keep, text in (("stres", "--keep stres: 'stres' is not a valid name (did you mean stress?)"), ("error", "needs --error")):
         assert run(beam, "--out", tmp_path / "new", "--keep", keep) == 2 and text in capsys.readouterr().err

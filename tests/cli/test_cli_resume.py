@@ -34,7 +34,7 @@ def assert_same_folders(a: Path, b: Path, rows: int = 0) -> None:
     assert names[0] == names[1] and {"frames/00006.png", "vtu/00006.vtu", "frames.csv"} <= set(names[0])
     assert not {"chunks", "scene.usdc.part"} & set(names[0])
     for name in names[0]:
-        if name.startswith(("frames", "vtu/", "scene.pvd")) and (a / name).is_file():
+        if name.startswith(("frames", "vtu/", "states/", "scene.pvd")) and (a / name).is_file():
             assert (a / name).read_bytes() == (b / name).read_bytes(), name
     steps = [(folder / "steps.csv").read_text().splitlines() for folder in (a, b)]
     assert len(steps[0]) == 7 and steps[0][rows:] == steps[1][max(0, len(steps[1]) - 7 + rows) :]

@@ -32,7 +32,7 @@ def test_obj(tmp_path):
     path = tmp_path / "cube.obj"
     lines = ["# a cube", *(f"v {x} {y} {z} 1.0" for x, y, z in CUBE), "vt 0 0", "vn 0 1 0", "usemtl none"]
     lines += [f"f {' '.join(f'{k + 1}/1/1' for k in quad)}  # side" for quad in QUADS[:-1]]
-    lines += ["f " + " ".join(f"{k - 8}//1" for k in QUADS[-1])]
+    lines += ["f " + " ".join(f"{k - 8}/-1/1" for k in QUADS[-1])]
     path.write_text("\n".join(lines))
     check_unit_cube(read_surface(path))
 
@@ -66,10 +66,15 @@ V = "v 0 0 0\nv 1 0 0\nv 0 1 0\n"
         ("a.off", "OFF 3 1 0\n" + POINTS + "3 0 1 3\n", r"line 5: vertex 3 does not exist \(3 vertices\)"),
         ("a.off", "OFF 3 1 0\n" + POINTS + "3 0 1 0_2\n", "line 5: expected a number of at least 3"),
         ("a.off", "OFF 3 0 0\n" + POINTS, "no triangles found"),
-        ("a.obj", "v 0 0\n", "line 1: expected v and three coordinates, or f and at least 3 corners, not 'v 0 0'"),
+        ("a.obj", "v 0 0\n", "line 1: expected v and three coordinates, not 'v 0 0'"),
         ("a.obj", V.replace("1 0\n", "nan 0\n") + "f 1 2 3\n", "vertex 2 coordinate 1 is not finite"),
         ("a.obj", V + "f 1 2 4\n", r"triangle 0: vertex 3 does not exist \(3 vertices\)"),
-        ("a.obj", V + "f 1 0 1\n", "line 4: expected v and three"),
+        ("a.obj", V + "f 1 0 1\n", "line 4: expected f and at least 3 corners"),
+        ("a.obj", V + "vt x\n", "line 4: expected vt and one or two numbers, not 'vt x'"),
+        ("a.obj", V + "vt 0 0\nf 1/1 2 3/1\n", "line 5: expected f and at least 3 corners, all or none of them with a vt"),
+        ("a.obj", V + "vt 0 0\nf /1 /1 /1\n", "line 5: expected f and at least 3 corners"),
+        ("a.obj", V + "vt 0 0\nf 1/1 2/1 3/2\n", r"line 5: vt 2 does not exist \(1 are given\)"),
+        ("a.obj", V + "f 1/-2 2/-1 3/-1\nvt 0 0\n", r"line 4: vt -2 does not exist \(1 are given\)"),
         ("a.ply", "passphrase", "line 1: not a supported surface: expected ply$"),
         ("a.msh", "x", "a surface is read from .obj, .stl, .ply, .off, not from .msh"),
     ],

@@ -143,12 +143,22 @@ def test_a_camera_with_z_up_is_one_with_y_up_turned():
 def test_camera_moves_back_from_approaching_bodies():
     camera = Viewpoint(target=np.zeros(3), distance=10.0, azimuth=0.0, elevation=0.0, fov=90.0)
     near = np.array([[0.0, 1, 0], [2, 0, 0]])
-    border = 40 / camera.widened(np.array([[0.0, -40, 0]]), (200, 100), 100.0).distance
-    assert 0.9 < border < 1
-    assert camera.widened(near, (200, 100), 100.0) == camera
-    for far in ([0.0, -20 * border, 0], [40 * border, 0, 0], [0, 10 * border, 10], [0, 0, 20]):
-        assert camera.widened(np.array([far, [0, np.nan, 0]]), (200, 100), 100.0).distance == pytest.approx(20.0)
-    assert camera.widened(np.array([[0.0, 900, 0]]), (200, 100), 15.0).distance == 15.0
+    size, border = (200, 100), camera._slopes(WHOLE, (200, 100), 1.0)[1] / camera._slopes(WHOLE, (200, 100), 1.0 - BORDER)[1]
+    edge = 1.0 / border[1]  # of what is seen, over the depth
+    assert camera.widened(near, size, 100.0) == camera
+    corners = 10.0 * edge * np.array([[-2.0, -1, 0], [2, -1, 0], [-2, 1, 0], [2, 1, 0]])
+    for far, distance in (
+        ([0.0, -20 * edge, 0], 15.0),
+        ([40 * edge, 0, 0], 15.0),
+        ([0, 10 * edge, 10], 15.0),
+        ([0, 0, 20], 20.0),
+    ):
+        moved = camera.widened(np.array([far, [0, np.nan, 0]]), size, 100.0)
+        assert moved.distance == pytest.approx(distance)
+        again = moved.widened(np.concatenate([[far], corners]), size, 100.0)
+        assert np.allclose(again.position, moved.position), "what was seen stays in view"
+    limited = camera.widened(np.array([[0.0, 900, 0]]), size, 15.0)
+    assert limited.distance == 15.0 and np.allclose(limited.widened(corners, size, 100.0).position, limited.position)
 
 
 def test_floor_that_reaches_behind_the_camera_is_clipped():

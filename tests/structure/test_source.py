@@ -54,7 +54,7 @@ ORDER = (
     ("settings",),
     ("dynamics",),
     ("output.viewpoint", "output.nodal_fields"),
-    ("output.appearance", "view.shading", "view.drawn"),
+    ("output.appearance", "output.smoothing", "view.shading", "view.drawn"),
     ("view.colouring", "view.raster"),
     ("output.connection_lines",),
     ("view.connection_layer", "view.ground", "view.sampling"),

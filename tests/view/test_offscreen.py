@@ -11,12 +11,13 @@ from taisoft.backend.runtime import open_kind, open_runtime
 from taisoft.errors import OutputError, SimulationError
 from taisoft.mesh.placing import FROM_Y_UP
 from taisoft.output.viewpoint import Viewpoint, start_positions
-from taisoft.view.colouring import COLOURS, Colouring, round_up
+from taisoft.view.colouring import COLOURS, Colouring, lit_colours, round_up
 from taisoft.view.ggui import Canvas
 from taisoft.view.offscreen import Offscreen, stroke
 from taisoft.view.raster import Raster
 from taisoft.view.scene_view import IMPULSE_COLOUR, MARKER_COLOUR, NORMAL_COLOUR, TRACTION_COLOUR, WIRE_COLOUR, Surfaces
 from taisoft.view.window import show
+from tests.dynamics.scenes import rubber
 from tests.view.drawing import SIZE, body_mask, needs_vulkan, sampled
 from tests.view.fake_simulator import FakeSimulator, beam_scene
 
@@ -197,6 +198,51 @@ def test_bodies_alone_are_coloured_by_stress():
     assert red[:, 80:].any() and not red[:, :60].any(), "the stress of FakeSimulator grows along x"
 
 
+def walls(opacity: float, of_ground: float = 1.0) -> ts.Scene:
+    """A red beam in front of a blue one, above a ground."""
+    scene = beam_scene(("near", "far"))
+    for body, colour, z in zip(scene.bodies, ("#ff0000", "#0000ff"), (1.0, -1.0)):
+        body.colour, body.position = colour, (0, 0, z)
+    scene.bodies[0].opacity = opacity
+    scene.add_ground(-2.0, colour="#00ff00", opacity=of_ground)
+    return scene
+
+
+FRONT = Viewpoint(np.zeros(3), 9.0, azimuth=0.0, elevation=10.0)
+
+
+def test_a_transparent_body_shows_what_is_behind_it():
+    """In proportion, whatever the order of the bodies, and markers and a ground as well."""
+    images = [Offscreen(scene, SIZE, FRONT).image(FakeSimulator(scene)).astype(float) for scene in map(walls, (1.0, 0.6, 0.05))]
+    middle = np.array([image[SIZE[1] // 2 - 3, SIZE[0] // 2] for image in images])
+    assert (np.diff(middle[:, 0]) < -30).all() and (np.diff(middle[:, 2]) > 30).all()
+    scene = walls(0.6)
+    scene.bodies.reverse()
+    assert np.abs(Offscreen(scene, SIZE, FRONT).image(FakeSimulator(scene)) - images[1]).max() <= 1
+    surfaces = Surfaces(scene)
+    assert set(surfaces.opacities[(surfaces.colours == MARKER_COLOUR).all(axis=1)]) == {0.6, 1.0}
+    wired = Offscreen(walls(0.05), SIZE, FRONT, layers=("wires",)).image(FakeSimulator(scene))
+    assert (wired.max(axis=2) < 60).any(), "lines are opaque"
+    ground, clear = ((Offscreen(scene, SIZE, FRONT).image(FakeSimulator(scene))) for scene in (walls(1.0), walls(1.0, 0.1)))
+    low = ground[-20:].astype(int) - clear[-20:]
+    assert (low[..., 0] < -50).all() and (low[..., 1] < 50).all(), "the light background comes through"
+
+
+def test_a_scene_has_its_own_lights_and_background():
+    """Without lights there is that of the sky, which has no direction from left to right."""
+    images = []
+    for lights in ((), (ts.Light((-1, 0, 0), 0.9, "#ff8000"),)):
+        scene = ts.Scene()
+        scene.add_body(ts.ball_mesh(1.0, 8), rubber(), colour="#808080")
+        scene.lights, scene.background = lights, ("#102030", "#405060")
+        images.append(Offscreen(scene, (120, 120), FRONT).image(FakeSimulator(scene)).astype(int))
+        assert images[-1][0, 0].tolist() == [16, 32, 48] and images[-1][-1, 0].tolist() == [64, 80, 96]
+    plain, lit = images
+    assert np.abs(plain - plain[:, ::-1]).max() <= 6 and np.abs((lit - plain)[:, :55]).max() <= 1
+    added = (lit - plain)[60, 60:].max(axis=0)  # on the right
+    assert added[0] > 70 and added[1] == pytest.approx(added[0] * 128 / 255, abs=3) and added[2] == 0
+
+
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="DISPLAY names displays on Linux only")
 @pytest.mark.parametrize("display, reason", [("", "DISPLAY is not set"), (":4711", "':4711' does not answer")])
 def test_without_a_display_a_window_is_refused(display, reason, monkeypatch):
@@ -224,6 +270,26 @@ def test_a_process_has_one_window_which_leaves_no_files(tmp_path, monkeypatch):
     (tmp_path / "imgui.ini").write_text("[Window][mine]\n")
     Canvas(surfaces, SIZE, visible=False).close()
     assert "[Window][mine]" in (tmp_path / "imgui.ini").read_text()
+
+
+@needs_vulkan
+def test_the_window_blends_transparent_surfaces_from_far_to_near():
+    """As pictures do, to a few pixels, in whatever order the bodies were added."""
+    for scene in (walls(0.5), walls(0.5)):
+        drawing = Offscreen(scene, SIZE, FRONT)
+        state = sampled(FakeSimulator(scene))
+        x, normals = drawing.surfaces.with_obstacles(drawing.surfaces.of_bodies(state), state, FRONT.position)
+        colours, lines = lit_colours(x, normals, drawing.surfaces.colours, FRONT), (np.zeros((0, 3)), np.zeros((0, 3)))
+        canvas = Canvas(drawing.surfaces, SIZE, visible=False)
+        try:
+            canvas.draw(x, colours, FRONT, (1, 1, 1), lines)
+            shown = canvas.pixels(0, 0, *SIZE).astype(int)
+        finally:
+            canvas.close()
+        expected = drawing.image(state)
+        middle = slice(SIZE[1] // 2 - 10, SIZE[1] // 2 + 5), slice(SIZE[0] // 4, 3 * SIZE[0] // 4)
+        assert (np.abs(shown - expected)[middle].max(axis=2) > 8).mean() < 0.03
+        scene.bodies.reverse()
 
 
 @needs_vulkan

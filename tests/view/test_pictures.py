@@ -137,7 +137,7 @@ def test_both_ways_write_the_same_bytes(name, tmp_path):
         beside.frame(state, index)
     beside.flush()
     kept = [[writer.kept(t) for t in (sim.time, sim.time + 1.0)] for writer in (between, beside)]
-    assert kept[0] == kept[1] and kept[0][1]["camera"] > 0.0
+    assert kept[0] == kept[1] and kept[0][1]["camera"][-1] > 0.0
     assert (kept[0][1]["impulse"] > 0.0) == ("contacts" in options.layers)
     between.close()
     beside.close()

@@ -207,6 +207,8 @@ def test_a_caption_is_at_the_bottom(monkeypatch):
     left, top, right, bottom = bounds(plain, grey())
     assert left < 12 and 190 < right < 340 and 318 < top < 336 and bottom <= 355
     assert not np.array_equal(Annotations(name="bücher").draw(grey(), state, 8), plain), "frame number"
+    dark = Annotations(name="bücher").draw(grey() // 4, state, 7)
+    assert plain.min() < 60 and plain.max() < 230 and dark.max() > 240, "light text on dark pictures"
     both = Annotations(filled(), "beam").draw(grey(), state, 0)
     assert (both[10:280, : SIZE[0] - 160] == 120).all(), "the bodies stay visible"
     monkeypatch.setattr(annotations, "find_spec", lambda name: None if name == "matplotlib" else 1)
@@ -231,8 +233,9 @@ def test_a_colour_bar_follows_the_scale_and_fits_a_small_picture():
     assert np.array_equal(pictures[2][681, 16:236], bar), "only the numbers differ"
     both = Annotations(name="beam", colouring=colouring).draw(grey(LARGE), state, 0)
     assert np.array_equal(both[681 - 60, 16:236], bar), "above the caption"
-    small = grey((64, 36))  # where the steps of the bar are narrower than a pixel
-    assert (bar_alone.draw(small, state, 7) != small).any()
+    for size in ((64, 36), (1, 1)):  # where the steps of the bar, and letters, are smaller than a pixel
+        everything = Annotations(filled(), "a $b", colouring).draw(grey(size), state, 7)
+        assert everything.shape == (size[1], size[0], 3) and (size == (1, 1) or (everything != 120).any())
 
 
 def test_a_run_draws_plots_and_captions(tmp_path):

@@ -1,4 +1,4 @@
-"""The rasteriser of pictures, against the one in NumPy: coverage, order, colours, invisible triangles and shadow maps."""
+"""The rasteriser of pictures, against the one in NumPy: coverage, order, opacity, colours, invisible triangles, shadow maps."""
 
 import numpy as np
 import pytest
@@ -20,7 +20,7 @@ def runtime():
     runtime.close()
 
 
-def drawn(points, triangles, colours, shape=SHAPE, near=NEAR, shadows=None, texels=None, raster=None):
+def drawn(points, triangles, colours, shape=SHAPE, near=NEAR, shadows=None, texels=None, raster=None, opacities=None):
     """The picture and 1/depth of the kernels."""
     made = raster or Raster(shape[::-1])
     attributes = np.zeros((len(points), N_ATTRIBUTES))
@@ -28,7 +28,7 @@ def drawn(points, triangles, colours, shape=SHAPE, near=NEAR, shadows=None, texe
     if texels is not None:
         attributes[:, 3:] = texels
     picture = np.full((shape[0] // SAMPLES, shape[1] // SAMPLES, 3), 200, np.uint8)
-    made.draw(points, triangles, attributes, near, np.zeros((1, 2, 2)) if shadows is None else shadows, picture)
+    made.draw(points, triangles, attributes, near, np.zeros((1, 2, 2)) if shadows is None else shadows, picture, opacities)
     return picture, made.inverse_depths(points, triangles, near)
 
 
@@ -59,6 +59,45 @@ def test_random_triangles_equal_those_of_numpy():
         reference, covered = expected(points, triangles, flat)
         assert 0.01 < covered.mean() <= 1.0 and np.array_equal(inverse > 0, covered)
         assert np.abs(picture.astype(int) - reference).max() <= 1
+
+
+def blended(points, triangles, colours, opacities):
+    """The picture of NumPy, sample by sample: triangles of one colour each over one another from the farthest on."""
+    y, x = np.mgrid[: SHAPE[0], : SHAPE[1]] + 0.5
+    layers = np.zeros((len(triangles), *SHAPE))  # 1/depth
+    for layer, (p, q, r) in zip(layers, points[triangles]):
+        (a, b), (c, d) = q[:2] - p[:2], r[:2] - p[:2]
+        v, w = (d * (x - p[0]) - c * (y - p[1])) / (a * d - b * c), (a * (y - p[1]) - b * (x - p[0])) / (a * d - b * c)
+        inside = (v >= 0) & (w >= 0) & (v + w <= 1)
+        layer[inside] = ((1 - v - w) / p[2] + v / q[2] + w / r[2])[inside]
+    image = np.full((*SHAPE, 3), 200.0)
+    for k in np.argsort(layers, axis=0):
+        covered = np.take_along_axis(layers, k[None], axis=0)[0] > 0
+        share = np.where(covered, opacities[k], 0.0)[..., None]
+        image = (1 - share) * image + share * 255 * colours[3 * k]
+    return image.reshape(SHAPE[0] // SAMPLES, SAMPLES, SHAPE[1] // SAMPLES, SAMPLES, 3).mean(axis=(1, 3))
+
+
+def test_transparent_triangles_are_blended_by_depth_whatever_their_order():
+    """Those that intersect, too."""
+    raster = Raster(SHAPE[::-1])
+    for n, radius, least in ((60, 60.0, 0.1), (300, 15.0, 0.3), (40, 200.0, 0.02)):
+        rng = np.random.default_rng(1)
+        points, triangles = scattered(rng, n, radius)
+        flat = np.repeat(rng.uniform(0, 1, (n, 3)), 3, axis=0)
+        opacities = np.where(rng.uniform(size=n) < 0.2, 1.0, rng.uniform(least, 1.0, n))
+        picture, _ = drawn(points, triangles, flat, raster=raster, opacities=opacities)
+        assert np.abs(picture - blended(points, triangles, flat, opacities)).max() < 1.1
+        mixed = rng.permutation(n)
+        again, _ = drawn(points, triangles[mixed], flat, raster=raster, opacities=opacities[mixed])
+        assert np.array_equal(picture, again)
+
+
+def test_samples_on_the_edge_of_two_transparent_triangles_are_drawn_once():
+    square = np.array([[0.0, 0, 1], [64, 0, 1], [64, 64, 1], [0, 64, 1]])
+    triangles, half = np.array([[0, 1, 2], [0, 2, 3]]), np.full(2, 0.5)  # the diagonal passes through centres of samples
+    picture, _ = drawn(square, triangles, np.zeros((4, 3)), shape=(64, 64), opacities=half)
+    assert (picture == 100).all()
 
 
 def test_colours_are_interpolated_in_perspective():

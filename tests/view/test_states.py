@@ -111,6 +111,7 @@ def test_a_write_error_is_raised_later(tmp_path):
     writer = StateWriter(tmp_path, Sampler(sim.scene), (), [], ((), "body"))
     shutil.rmtree(tmp_path / "states")
     writer.frame(sim, 0)
-    with pytest.raises(OutputError, match="cannot write .*00000.npz"):
-        writer.flush()
+    for use in (writer.flush, lambda: writer.frame(sim, 1), writer.close):
+        with pytest.raises(OutputError, match="cannot write .*00000.npz"):
+            use()
     writer.close()

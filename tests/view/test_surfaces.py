@@ -4,13 +4,14 @@ import numpy as np
 import pytest
 
 import taisoft as ts
+from taisoft.output.smoothing import smoothing_groups, vertex_normals
 from taisoft.output.viewpoint import Viewpoint
 from taisoft.scene.key_frames import KeyFrames
 from taisoft.view.drawn import DrawnScene
 from taisoft.view.ground import Square, finite_points
 from taisoft.view.offscreen import Offscreen
 from taisoft.view.picking import MouseDrag, nearest_hit, pick
-from taisoft.view.scene_view import MARKER_COLOUR, Layers, Surfaces, smoothing_groups, vertex_normals
+from taisoft.view.scene_view import MARKER_COLOUR, Layers, Surfaces
 from taisoft.view.shadow import Shadows, blurred
 from taisoft.view.window_shadow import ShadowMesh
 from tests.view.drawing import sampled
@@ -138,6 +139,26 @@ def test_shadows_on_slopes_and_moving_half_spaces_and_of_nodes_that_are_not_fini
     assert none.max() == 0.0 and (at[:, 2] == -1).all()
 
 
+def test_shadows_fall_along_the_first_light_from_above_and_are_lighter_below_transparent_bodies():
+    """A light that is nearly level casts none."""
+    low, side = ts.Light((1, -0.1, 0)), ts.Light((1, -1, 0))
+    for lights, moved in ((None, 0.0), ((), 0.0), ((low,), 0.0), ((low, side, ts.Light((0, -1, 0))), 1.0)):
+        scene = cube_above(1.0)
+        scene.lights = lights
+        surfaces = Surfaces(scene)
+        state = sampled(FakeSimulator(scene))
+        x, _ = surfaces.with_obstacles(surfaces.of_bodies(state), state, ABOVE.position)
+        (shadow,) = Shadows(state.scene, surfaces).maps(x, state.poses)
+        v, u = (weights @ (np.arange(len(weights)) + 0.5) for weights in (shadow.darkness.sum(axis=k) for k in (1, 0)))
+        centre = shadow.origin + (np.array([u, v]) / shadow.darkness.sum() * shadow.texel + shadow.low) @ shadow.axes[:2]
+        height = x[: surfaces.n_of_bodies, 1].mean()
+        assert centre[[0, 2]] == pytest.approx([moved * height, 0.0], abs=0.3)
+    scene = cube_above(0.1)
+    dark, _ = maps_of(scene)
+    scene.bodies[0].opacity = 0.25
+    assert np.allclose(maps_of(scene)[0], 0.25 * dark)
+
+
 def test_the_window_has_the_shadow_as_a_mesh_on_the_ground():
     scene = cube_above(0.1)
     surfaces = Surfaces(scene)
@@ -151,6 +172,11 @@ def test_the_window_has_the_shadow_as_a_mesh_on_the_ground():
     assert np.allclose(points, on_ground, atol=0.02) and (points[:, 1] > 0).all()
     assert np.abs(on_ground[colours[:, 0].argmin()][[0, 2]]).max() < 0.5, "darkest below the cube"
     assert colours[triangles].min() < 0.7 * colours[triangles].max()
+    clear = ts.Scene()
+    clear.add_body(scene.bodies[0].mesh, RUBBER, position=scene.bodies[0].position)
+    clear.add_ground(opacity=0.5)
+    clear = DrawnScene.of(clear)
+    assert ShadowMesh(clear, Surfaces(clear)).draw(x, {}, ABOVE) is None, "it would hide what a transparent ground shows"
 
 
 def test_a_blur_keeps_the_sum_and_spreads_by_its_deviation():

@@ -1,0 +1,109 @@
+"""Looks of scenes: colours, opacity, lights, background and camera are validated, kept by files and set by name, and change
+nothing that a checkpoint compares.
+"""
+
+import numpy as np
+import pytest
+
+import taisoft as ts
+from taisoft.output.viewpoint import Viewpoint
+from taisoft.scene.fingerprint import scene_digest
+from taisoft.scene.numbers import set_numbers
+from tests.dynamics.scenes import cube, rubber
+from tests.scene.toml_scenes import there_and_back
+
+
+def plain() -> ts.Scene:
+    scene = ts.Scene()
+    scene.add_body(cube(), rubber(), name="ball")
+    scene.add_rigid_body(cube(), name="stone", position=(3, 0, 0))
+    scene.add_ground(-2.0)
+    scene.add_obstacle(ts.Sphere((0, 0, 9), 1.0), name="moon", path=ts.KeyFrames((0, 1), [(0, 0, 0), (1, 0, 0)]))
+    return scene
+
+
+def painted() -> ts.Scene:
+    scene = plain()
+    scene.background = "#102030", (1 / 3, 0.0, 1.0)
+    scene.lights = [ts.Light((1, -2, 1 / 3), 0.3, "#ffd9a8"), ts.Light((-0.1, -1, 0), colour=(0.1, 0.2, 1 / 7))]
+    scene.camera = ts.Camera([(0, 1, 9), (9, 1, 1 / 3)], fov=[30, 45], times=(0, 1 / 3), follow="ball")
+    look = {"colour": "#d94a3d", "opacity": 1 / 3}
+    for part in scene.bodies:
+        part.colour, part.opacity = look.values()
+    set_numbers(scene, {f"{name}.{key}": value for name in ("ground", "moon") for key, value in look.items()})
+    return scene
+
+
+def test_looks_are_kept_by_files_and_only_those_that_are_set(tmp_path):
+    there_and_back(tmp_path / "a.toml", scene := painted(), {})
+    text = (tmp_path / "a.toml").read_text()
+    assert text.count('colour = "#d94a3d"') == 4 and 'colour = "#ffd9a8"' in text and repr(1 / 7) in text
+    for value in ("#102030", ("#102030", "#405060"), (0.1, 0.2, 0.3)):
+        scene.background = value
+        there_and_back(tmp_path / "a.toml", scene, {})
+    assert "background = [0.1, 0.2, 0.3]" in (tmp_path / "a.toml").read_text()
+    scene.lights, scene.camera = (), ts.Camera((0, 0, 9))
+    there_and_back(tmp_path / "a.toml", scene, {})
+    assert "lights = []" in (tmp_path / "a.toml").read_text()
+    there_and_back(tmp_path / "b.toml", plain(), {})
+    text = (tmp_path / "b.toml").read_text()
+    assert not any(word in text for word in ("colour", "opacity", "background", "lights", "camera"))
+
+
+def test_looks_are_set_by_name_and_are_no_part_of_what_a_run_depends_on():
+    scene = plain()
+    before = scene_digest(scene)
+    assert scene_digest(painted()) == before
+    set_numbers(scene, {"ball.colour": "#ff0000", "moon.opacity": 0.4, "scene.background": "#000000", "stone.colour": [0, 1, 0]})
+    assert scene.body("ball").colour.tolist() == [1, 0, 0] and scene.body("stone").colour.tolist() == [0, 1, 0]
+    assert scene.obstacle("moon").opacity == 0.4 and not scene.background.any() and scene_digest(scene) == before
+    assert scene.obstacle("moon").pose(1.0)[0].tolist() == [1, 0, 0]
+    for name, value, message in (
+        ("ball.colour", "red", "body 'ball': colour must be '#rrggbb', such as '#d94a3d', or three numbers, not 'red'"),
+        ("moon.opacity", 0, "obstacle 'moon': opacity must be at least 0.02 and at most 1, not 0"),
+        ("ball.color", "#ffffff", r"the scene has no number 'ball.color' \(did you mean ball.colour\?\)"),
+        ("scene.background", [2, 0, 0], "scene: background: red, green and blue must be from 0 to 1"),
+    ):
+        with pytest.raises(ts.SceneError, match=message):
+            set_numbers(scene, {name: value})
+
+
+def test_a_run_is_resumed_with_other_looks(tmp_path):
+    with ts.Simulator(plain(), dt=0.01) as sim:
+        sim.step()
+        sim.save_checkpoint(tmp_path / "a.npz")
+    with ts.Simulator.load_checkpoint(tmp_path / "a.npz", painted()) as sim:
+        assert sim.time == pytest.approx(0.01) and sim.scene.body("ball").opacity == 1 / 3
+
+
+def test_a_camera_passes_its_key_frames_turning_about_its_target():
+    positions = np.array([(0.0, 1.0, 9.0), (9.0, 1.0, 0.0), (0.0, 1.0, -9.0)])
+    camera = ts.Camera(positions, (0, 1, 0), fov=(30, 60, 30), times=(0, 1, 2))
+    for t, at, fov in ((-1.0, positions[0], 30), (1.0, positions[1], 60), (5.0, positions[2], 30)):
+        view = Viewpoint(**camera.at(t, "y"))
+        assert np.allclose(view.position, at) and np.allclose(view.target, (0, 1, 0)) and view.fov == pytest.approx(fov)
+    between = Viewpoint(**camera.at(0.4, "y"))
+    assert between.distance == pytest.approx(9.0) and 30 < between.fov < 60
+    zoomed = camera.zoom(2.0)
+    assert np.tan(np.radians(zoomed.fov / 2)) == pytest.approx(np.tan(np.radians(camera.fov / 2)) / 2)
+
+
+@pytest.mark.parametrize(
+    "make, message",
+    [
+        (lambda: ts.Light((0, 0, 0)), "light: direction must not be zero"),
+        (lambda: ts.Light((0, -1, 0), strength=-1), "light: strength must be at least 0"),
+        (lambda: ts.Light((0, -1, 0), colour="#12345"), "light: colour must be '#rrggbb'"),
+        (lambda: ts.Camera((0, 0, 0)), "camera: position and target must differ, but are the same"),
+        (lambda: ts.Camera([(0, 0, 1)] * 2, times=(1, 1)), "camera: times must ascend"),
+        (lambda: ts.Camera([(0, 0, 1), (0, 0, 0)], times=(1, 2)), "differ, but are the same at time 2 s"),
+        (lambda: ts.Camera((0, 0, 1), fov=150), "camera: fov must be from 1 to 120 degrees, not 150"),
+        (lambda: ts.Camera((0, 0, 1), up="x"), "camera: up must be one of y, z, not 'x'"),
+        (lambda: setattr(plain(), "lights", [ts.Light((0, 0, 1)), 3]), "scene: light 1 must be a Light, not 3"),
+        (lambda: setattr(plain(), "lights", [ts.Light((0, 0, 1))] * 9), "scene: there are 9 lights; 8 are the most"),
+        (lambda: setattr(plain(), "camera", (0, 0, 1)), "scene: camera must be a Camera or None, not tuple"),
+    ],
+)
+def test_bad_looks_are_refused(make, message):
+    with pytest.raises(ts.SceneError, match=message):
+        make()
