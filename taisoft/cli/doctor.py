@@ -17,7 +17,7 @@ from taisoft import __version__
 
 REQUIRED = ("taichi", "numpy", "scipy", "meshio", "usd-core", "networkx", "rich")
 # package -> the extra that installs it; only benchmarks use other programs, only studies and run_many use a cluster
-OPTIONAL = {"wildmeshing": "mesh", "imageio-ffmpeg": "video", "matplotlib": "plot", "pillow": "plot", "viser": "notebook"}
+OPTIONAL = {"wildmeshing": "mesh", "imageio-ffmpeg": "video", "matplotlib": "plot", "viser": "notebook"}
 OPTIONAL |= {"pyvista": "pyvista", "distributed": "cluster", "mujoco-core": "robot", "pybullet": "peers", "newton": "peers"}
 OPTIONAL |= {"argcomplete": "completion", "gymnasium": "gym"}
 KERNEL = "ipykernel"  # of Jupyter, which no extra installs

@@ -1,8 +1,8 @@
 """Plots over time of the step reports: energies, residuals, iterations, contacts, wall time of a step, and estimated errors.
 
-This module keeps the history of a run and computes the curves in a unit square; `taisoft.view.annotations` draws them on
-pictures. Only simulated quantities are available: no contacts if nothing can touch, no Newton iterations for explicit
-steps. Where errors are estimated, energies are drawn as bands: plus and minus the error in time at the last comparison.
+This module keeps the history of a run; `taisoft.view.annotations` draws it on pictures. Only simulated quantities are available:
+no contacts if nothing can touch, no Newton iterations for explicit steps. Where errors are estimated, energies are drawn as
+bands: plus and minus the error in time at the last comparison.
 
 The history takes constant memory: minimum and maximum of every quantity over bins of consecutive steps. A bin holds one step
 until CAPACITY bins are full. Then neighbours are merged in pairs, and from there on a bin holds twice as many steps. So no peak
@@ -11,37 +11,33 @@ is lost, however long a simulation runs, and early and late steps have the same 
 Some plots show a quantity of each pair that presses, or of each body: the few largest.
 """
 
-import math
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
 from taisoft.errors import SceneError
 from taisoft.records import ERROR_KINDS, ErrorEstimate, StepReport
 from taisoft.scene.checks import nearest
-from taisoft.view.colouring import round_up
 from taisoft.view.drawn import ENERGIES
 
 BLUE, ORANGE, GREEN, DARK = (0.16, 0.42, 0.74), (0.87, 0.42, 0.13), (0.20, 0.56, 0.28), (0.30, 0.30, 0.36)  # sRGB
-COLOURS = (BLUE, ORANGE, GREEN, DARK)  # of a plot with curves by pair or body, as many as it shows
-GRID_LINES = 4  # at most, between the ends of an axis
-MIN_SPAN = 1e-200  # values that span less count as constant
-MAX_DECADES = 12  # of a logarithmic axis; smaller values, and zero, lie on its lower end
+COLOURS = (BLUE, ORANGE, GREEN, DARK)  # of a plot's curves; by pair or body it shows as many
 OF_PAIRS = {"forces": "contact_force", "torques": "contact_torque"}  # plot by pair -> query
 CAPACITY = 256  # bins, an even number
 SOLVERS = ("newton_residual", "contact_residual", "newton_iterations", "linear_iterations", "contact_iterations", "n_contacts")
-ERRORS = tuple(f"{kind}_error" for kind in ERROR_KINDS)  # over the largest excursion, in percent
-QUANTITIES = (*ENERGIES, "total", *SOLVERS, "step_time", *ERRORS)  # energies as changes since the start, wall time in [ms]
+# energies as changes since the start, wall time in [ms], errors over the largest excursion in percent
+QUANTITIES = (*ENERGIES, "total", *SOLVERS, "step_time", *(f"{kind}_error" for kind in ERROR_KINDS))
 
 
 @dataclass(frozen=True)
 class Series:
-    """One curve of a plot. quantity: column of `History`; needs: "implicit" steps, "contact" forces, "error" estimates or ""."""
+    """One curve of a plot. needs: "implicit" steps, "contact" forces, "error" estimates or ""; quantity: column of `History`."""
 
     name: str
-    quantity: str
     colour: tuple[float, float, float]
-    needs: str = ""
+    needs: str
+    quantity: str
 
 
 @dataclass(frozen=True)
@@ -55,37 +51,22 @@ class Plot:
     many: bool = False
 
 
+_newton, _linear = partial(Series, "Newton", BLUE, "implicit"), partial(Series, "CG", GREEN, "implicit")
+_contacts, _step = partial(Series, "contacts", ORANGE, "contact"), partial(Series, "step", BLUE, "")
+_iterations = _newton("newton_iterations"), _linear("linear_iterations"), _contacts("contact_iterations")
+_changes = tuple(Series(name, colour, "", name) for name, colour in zip(QUANTITIES, COLOURS))
+_errors = tuple(Series(kind, colour, "error", f"{kind}_error") for kind, colour in zip(ERROR_KINDS, (BLUE, ORANGE, GREEN)))
 PLOTS = {
-    "energies": Plot(
-        "energy change", "J", tuple(Series(name, name, colour) for name, colour in zip(QUANTITIES, (BLUE, ORANGE, GREEN, DARK)))
-    ),
-    "residuals": Plot(
-        "residuals",
-        "",
-        (Series("Newton", "newton_residual", BLUE, "implicit"), Series("contacts", "contact_residual", ORANGE, "contact")),
-        log=True,
-    ),
-    "iterations": Plot(
-        "iterations of a step",
-        "",
-        (
-            Series("Newton", "newton_iterations", BLUE, "implicit"),
-            Series("CG", "linear_iterations", GREEN, "implicit"),
-            Series("contacts", "contact_iterations", ORANGE, "contact"),
-        ),
-    ),
-    "contacts": Plot("contacts", "", (Series("contacts", "n_contacts", ORANGE, "contact"),)),
-    "step_time": Plot("wall time of a step", "ms", (Series("step", "step_time", BLUE),), log=True),
-    "error": Plot(
-        "estimated error so far",
-        "%",
-        tuple(Series(name, f"{name}_error", colour, "error") for name, colour in zip(ERROR_KINDS, (BLUE, ORANGE, GREEN))),
-        log=True,
-    ),
-    "forces": Plot("force by pair", "N", (Series("", "forces", DARK, "contact"),), many=True),
-    "torques": Plot("torque by pair", "N m", (Series("", "torques", DARK, "contact"),), many=True),
-    "kinetic": Plot("kinetic energy by body", "J", (Series("", "kinetic", DARK),), many=True),
-    "elastic": Plot("elastic energy by body", "J", (Series("", "elastic", DARK),), many=True),
+    "energies": Plot("energy change", "J", _changes),
+    "residuals": Plot("residuals", "", (_newton("newton_residual"), _contacts("contact_residual")), log=True),
+    "iterations": Plot("iterations of a step", "", _iterations),
+    "contacts": Plot("contacts", "", (_contacts("n_contacts"),)),
+    "step_time": Plot("wall time of a step", "ms", (_step("step_time"),), log=True),
+    "error": Plot("estimated error so far", "%", _errors, log=True),
+    "forces": Plot("force by pair", "N", (_contacts("forces"),), many=True),
+    "torques": Plot("torque by pair", "N m", (_contacts("torques"),), many=True),
+    "kinetic": Plot("kinetic energy by body", "J", (_step("kinetic"),), many=True),
+    "elastic": Plot("elastic energy by body", "J", (_step("elastic"),), many=True),
 }
 
 
@@ -98,27 +79,11 @@ class History:
     """
 
     def __init__(self, sim, capacity: int = CAPACITY):
-        self.columns = list(QUANTITIES)
-        self._times, (self._low, self._high) = np.empty(capacity), np.empty((2, capacity, len(QUANTITIES)))
-        self._n = self._steps_in_last = 0
-        self._steps_per_bin = 1
+        self.columns, self._capacity = list(QUANTITIES), capacity
+        self._steps_per_bin = self._steps_in_last = 1
         self._start_energies, self.begin = _energies(sim.energies()), sim.time
-        self._append(sim.time, np.where(np.arange(len(QUANTITIES)) < 4, 0.0, np.nan), np.zeros(len(QUANTITIES)))
-
-    @property
-    def times(self) -> np.ndarray:
-        """Ends of the bins (n,) [s]."""
-        return self._times[: self._n]
-
-    @property
-    def low(self) -> np.ndarray:
-        """Minima over each bin (n, k)."""
-        return self._low[: self._n]
-
-    @property
-    def high(self) -> np.ndarray:
-        """Maxima over each bin (n, k)."""
-        return self._high[: self._n]
+        self.last = np.where(np.arange(len(QUANTITIES)) < 4, 0.0, np.nan)
+        self.times, self.low, self.high = np.array([sim.time]), self.last[None], self.last[None]
 
     def take(
         self,
@@ -136,83 +101,42 @@ class History:
         """
         energies = _energies(report) - self._start_energies
         solved, touched = (np.nan if explicit else 1.0), (1.0 if touching else np.nan)
-        row = np.array(
-            [
-                *energies,
-                energies.sum(),
-                report.residual * solved,
-                report.contact_residual * touched,
-                report.newton_iterations * solved,
-                report.linear_iterations * solved,
-                report.contact_iterations * touched / report.steps,
-                report.n_contacts * touched,
-                1e3 * seconds / report.steps,
-                *(
-                    100.0 * (np.nan if value is None else value)
-                    for value in (getattr(errors, kind, None) for kind in ERROR_KINDS)
-                ),
-            ]
-        )
-        new = [name for name in more if name not in self.columns]
-        if new:
+        row = [*energies, energies.sum(), solved * report.residual, touched * report.contact_residual]
+        row += [solved * report.newton_iterations, solved * report.linear_iterations]
+        row += [touched * report.contact_iterations / report.steps, touched * report.n_contacts, 1e3 * seconds / report.steps]
+        row += [*(100.0 * np.array([getattr(errors, kind, None) for kind in ERROR_KINDS], dtype=float))]
+        if new := [name for name in more if name not in self.columns]:
             self.columns += new
-            self._low, self._high = (np.pad(a, ((0, 0), (0, len(new))), constant_values=np.nan) for a in (self._low, self._high))
-        row = np.concatenate([row, [more.get(name, 0.0) for name in self.columns[len(QUANTITIES) :]]])
-        half = np.zeros(len(row))
+            self.low, self.high = (np.pad(a, ((0, 0), (0, len(new))), constant_values=np.nan) for a in (self.low, self.high))
+        self.last = np.append(row, [more.get(name, 0.0) for name in self.columns[len(QUANTITIES) :]])
+        self.last[~np.isfinite(self.last)] = np.nan
+        half = np.zeros(len(self.last))
         if errors is not None and errors.energies is not None:
             half[:4] = np.abs([*_energies(errors.energies), errors.energies.total])
-        self._append(report.time, np.where(np.isfinite(row), row, np.nan), half)
+        self._append(report.time, self.last - half, self.last + half)
 
-    def _append(self, time: float, row: np.ndarray, half: np.ndarray) -> None:
-        """Append a row, with half the width of each band."""
-        self.last = row
-        if self._n and self._steps_in_last < self._steps_per_bin:
-            k = self._n - 1
-            self._low[k], self._high[k] = np.fmin(self._low[k], row - half), np.fmax(self._high[k], row + half)
-            self._steps_in_last += 1
-        else:
-            if self._n == len(self._times):
-                self._merge_pairs()
-            k = self._n
-            self._low[k], self._high[k] = row - half, row + half
-            self._n, self._steps_in_last = k + 1, 1
-        self._times[k] = time
-
-    def _merge_pairs(self) -> None:
-        """Merge neighbouring bins in pairs; all bins are full."""
-        half = self._n // 2
-        self._times[:half] = self._times[1 : self._n : 2]
-        self._low[:half] = np.fmin(self._low[0 : self._n : 2], self._low[1 : self._n : 2])
-        self._high[:half] = np.fmax(self._high[0 : self._n : 2], self._high[1 : self._n : 2])
-        self._n, self._steps_per_bin = half, 2 * self._steps_per_bin
+    def _append(self, time: float, low: np.ndarray, high: np.ndarray) -> None:
+        if self._steps_in_last < self._steps_per_bin:
+            self.times[-1], self._steps_in_last = time, self._steps_in_last + 1
+            self.low[-1], self.high[-1] = np.fmin(self.low[-1], low), np.fmax(self.high[-1], high)
+            return
+        if len(self.times) == self._capacity:  # all full: merge neighbours
+            self.times, self._steps_per_bin = self.times[1::2], 2 * self._steps_per_bin
+            self.low, self.high = np.fmin(self.low[::2], self.low[1::2]), np.fmax(self.high[::2], self.high[1::2])
+        self.times, self._steps_in_last = np.append(self.times, time), 1
+        self.low, self.high = np.vstack([self.low, low]), np.vstack([self.high, high])
 
 
 def _energies(record) -> np.ndarray:
     return np.array([getattr(record, name) for name in ENERGIES])
 
 
-@dataclass(frozen=True)
-class Curves:
-    """Drawing of a plot, in a unit square with y upwards.
-
-    ends: low and high end of the axis as text; grid: heights of the grid lines; lines: colour and points (k,2) of each curve,
-    with rows of NaN at gaps; legend: name, last value and colour of each; times: first and last time [s].
-    """
-
-    title: str
-    ends: tuple[str, str]
-    grid: list[float]
-    lines: list[tuple[tuple, np.ndarray]]
-    legend: list[tuple[str, str, tuple]]
-    times: tuple[float, float]
-
-
 def plain_history(history: History) -> dict:
     """Return the arrays of a history as plain data, only with the columns that plots can show."""
     columns = [*QUANTITIES, *(s.quantity for plot in PLOTS.values() if plot.many for s in series_of(plot, history))]
     used = [history.columns.index(name) for name in columns]
-    parts = {"low": history.low[:, used], "high": history.high[:, used], "last": history.last[used]}
-    return {"times": history.times, "begin": history.begin, "columns": columns, **parts}
+    low, high, last = history.low[:, used], history.high[:, used], history.last[used]
+    return {"times": history.times, "begin": history.begin, "columns": columns, "low": low, "high": high, "last": last}
 
 
 def series_of(plot: Plot, history) -> tuple[Series, ...]:
@@ -223,7 +147,7 @@ def series_of(plot: Plot, history) -> tuple[Series, ...]:
     own = [k for k, name in enumerate(history.columns) if name.startswith(kind)]
     largest = np.argsort(-np.fmax.reduce(history.high[:, own], axis=0, initial=0.0), kind="stable")[: len(COLOURS)]
     names = [history.columns[own[k]] for k in sorted(largest)]
-    return tuple(Series(name.removeprefix(kind), name, colour) for name, colour in zip(names, COLOURS))
+    return tuple(Series(name.removeprefix(kind), colour, "", name) for name, colour in zip(names, COLOURS))
 
 
 class PlotChoice:
@@ -241,13 +165,9 @@ class PlotChoice:
         kept = {name: tuple(s for s in plot.series if enabled[s.needs]) for name, plot in PLOTS.items()}
         return {name: replace(PLOTS[name], series=series) for name, series in kept.items() if series}
 
-    def visible(self) -> list[str]:
-        """Return the names of the plots that are requested and available."""
-        return [name for name in self.available() if name in self.names]
-
-    def curves(self, name: str) -> "Curves":
-        """Return the present drawing of a plot."""
-        return curves_of(self.available()[name], self.history)
+    def visible(self) -> list[Plot]:
+        """Return the plots that are requested and available."""
+        return [plot for name, plot in self.available().items() if name in self.names]
 
 
 class Plots(PlotChoice):
@@ -269,12 +189,13 @@ class Plots(PlotChoice):
     @property
     def enabled(self) -> dict[str, bool]:
         """Which `needs` of series the simulator meets now."""
-        return {"implicit": not self._sim.settings.explicit, "contact": self._touching, "error": self._errors}
+        touching = self._sim.plan.on["contact_forces"]
+        return {"implicit": not self._sim.settings.explicit, "contact": touching, "error": self._errors}
 
     def take(self, report: StepReport, seconds: float) -> None:
         """Record a step report; seconds: its wall time [s]. For `on_step` of a run."""
-        errors = self._sim.error_so_far if self._errors else None
-        self.history.take(report, seconds, self._sim.settings.explicit, self._touching, errors, **self._by_name())
+        met, errors = self.enabled, self._sim.error_so_far if self._errors else None
+        self.history.take(report, seconds, not met["implicit"], met["contact"], errors, **self._by_name())
 
     def _by_name(self) -> dict[str, float]:
         """Return the columns of the requested plots by pair or body: forces [N], torques [N m] and energies [J]."""
@@ -286,10 +207,6 @@ class Plots(PlotChoice):
             found |= {f"{kind}: {body.name}": getattr(energies, kind) for kind in kinds}
         return found
 
-    @property
-    def _touching(self) -> bool:
-        return self._sim.plan.on["contact_forces"]
-
     def _why_unavailable(self, name: str) -> str:
         """Explain why a plot is not available."""
         reasons = {
@@ -299,51 +216,3 @@ class Plots(PlotChoice):
         }
         needs = {series.needs for series in PLOTS[name].series}
         return f"{', and '.join(text for key, text in reasons.items() if key in needs)}; there are {', '.join(self.available())}"
-
-
-def curves_of(plot: Plot, history: History) -> Curves:
-    """Return the drawing of a plot of a history."""
-    shown = series_of(plot, history)
-    columns = [history.columns.index(s.quantity) for s in shown]
-    low, high = history.low[:, columns], history.high[:, columns]
-    bottom, top, grid = (_log_axis if plot.log else _axis)(low, high)
-    first, last = history.begin, history.times[-1]
-    across = (history.times - first) / ((last - first) or 1.0)
-    lines, legend = [], []
-    for k, (column, series) in enumerate(zip(columns, shown)):
-        values = np.stack([low[:, k], high[:, k]], axis=1)
-        values = _logarithms(values, bottom) if plot.log else values
-        y = np.clip((values - bottom) / (top - bottom), 0.0, 1.0)
-        points = np.stack([np.repeat(across, 2), y.reshape(-1)], axis=1)
-        duplicate = np.repeat(values[:, 0] == values[:, 1], 2) & (np.arange(len(points)) % 2 == 1)
-        lines.append((series.colour, np.where(np.isnan(points[:, 1:]), np.nan, points)[~duplicate]))
-        value = history.last[column]
-        legend.append((series.name, "-" if math.isnan(value) else f"{value:.3g} {plot.unit}".rstrip(), series.colour))
-    ends = tuple(f"{10.0**end if plot.log else end:.4g} {plot.unit}".rstrip() for end in (bottom, top))
-    return Curves(plot.title, ends, grid, lines, legend, (float(first), float(last)))
-
-
-def _axis(low: np.ndarray, high: np.ndarray) -> tuple[float, float, list[float]]:
-    """Return the ends and grid lines of a linear axis that contains all values and 0, at multiples of a round number."""
-    lowest, highest = np.fmin.reduce(low, axis=None, initial=0.0), np.fmax.reduce(high, axis=None, initial=0.0)
-    if highest - lowest < MIN_SPAN:
-        return 0.0, 1.0, []
-    step = round_up((highest - lowest) / (GRID_LINES + 1))
-    first, last = math.floor(lowest / step + 1e-9), math.ceil(highest / step - 1e-9)
-    return first * step, last * step, [k / (last - first) for k in range(1, last - first)]
-
-
-def _log_axis(low: np.ndarray, high: np.ndarray) -> tuple[float, float, list[float]]:
-    """Do as `_axis`, in powers of ten for all values above 0."""
-    positive = np.concatenate([low[low > 0], high[high > 0]])
-    if not len(positive):
-        return -1.0, 0.0, []
-    top = math.ceil(math.log10(positive.max()) - 1e-9)
-    bottom = min(max(math.floor(math.log10(positive.min()) + 1e-9), top - MAX_DECADES), top - 1)
-    step = -(-(top - bottom) // (GRID_LINES + 1))
-    return float(bottom), float(top), [k / (top - bottom) for k in range(step, top - bottom, step)]
-
-
-def _logarithms(values: np.ndarray, bottom: float) -> np.ndarray:
-    """Return log10 of values; zero becomes the axis's lower end, NaN stays."""
-    return np.log10(values, out=np.where(np.isnan(values), np.nan, bottom), where=values > 0)
