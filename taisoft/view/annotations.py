@@ -18,7 +18,7 @@ HEIGHT, INCH = 720.0, 72.0
 MARGIN, WIDTH, PLOT_HEIGHT = 16, 300, 134  # around everything; of the plots, lower if there are more than five
 INSET = (50, 16, 18, 28)  # of the curves in a plot: left, right, below, above
 TITLE_SIZE, TEXT_SIZE, SMALL_SIZE, TICK_SIZE = 22, 15, 11, 10  # font sizes
-BAR = (220, 12)  # width and height of the colour bar
+BAR, BAR_HEIGHT = (220, 12), 56  # width and height of the colour bar; height with its texts
 INK, FAINT, GRID, PAPER = "#26292e", "#70747a", "#cdd0d4", "#fcfcfd"
 DARK = 100  # mean value of the picture's lower left corner below which text on it is light
 TICK_SPACE, MIN_SPAN, MAX_DECADES = 22, 1e-200, 12  # at least; values that span less count as constant; of a logarithmic axis
@@ -42,13 +42,16 @@ class Annotations:
             raise OutputError(missing)
         self._plots, self._name, self._colouring = plots, name, colouring
         self._size: tuple[int, int] | None = None
+        self._bar: tuple | None = None  # what it shows, and its layer
 
     def draw(self, picture: np.ndarray, state: DrawnState, index: int) -> np.ndarray:
         """Return an annotated copy of a picture, uint8 (height, width, 3), of a state; index: frame number."""
         height, width = picture.shape[:2]
-        self._clear((width, height))
         self._on_dark = picture[-(height // 4) :, : width // 3 + 1].mean() < DARK
-        if self._plots is not None and (plots := self._plots.visible()):
+        plots = self._plots.visible() if self._plots is not None else []
+        if plots or self._name is not None:
+            self._clear((width, height))
+        if plots:
             self._draw_plots(plots, width * HEIGHT / height - MARGIN)
         bottom = MARGIN  # of what comes next
         if self._name is not None:
@@ -56,14 +59,38 @@ class Annotations:
             self._write((MARGIN, bottom), f"frame {index}   t = {state.time:.4f} s   {text}", TEXT_SIZE)
             self._write((MARGIN, bottom + TEXT_SIZE + 8), self._name, TITLE_SIZE)
             bottom += TEXT_SIZE + TITLE_SIZE + 24
+        result = self._composed(picture) if plots or self._name is not None else picture.copy()
         if self._colouring is not None and (legend := self._colouring.legend()):
-            self._draw_colour_bar([text.strip() for text, _ in reversed(legend)], bottom)
+            texts = [text.strip() for text, _ in reversed(legend)]
+            opacity, layer = self._bar_layer(texts, bottom, (width, height))
+            part = result[-len(layer) :, : layer.shape[1]]
+            part[:] = (1.0 - opacity) * part + opacity * layer + 0.5
+        return result
+
+    def _composed(self, picture: np.ndarray) -> np.ndarray:
+        """Return a picture (height, width, 3) with all that has been added since `_clear` drawn over it."""
         pixels = np.asarray(self._renderer.buffer_rgba())
         for k in range(3):  # several times faster than all channels at once
             pixels[..., k] = picture[..., k]
         pixels[..., 3] = 255
         self._axes.figure.draw(self._renderer)
         return np.dstack([pixels[..., k] for k in range(3)])
+
+    def _bar_layer(self, texts: list[str], bottom: float, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+        """Return opacity (h,w,1) and colours (h,w,3) of the lower left part of a picture with the colour bar.
+
+        It is drawn again only when what it shows changes, or the size of the pictures.
+        """
+        key = *texts, bottom, size, self._on_dark, self._colouring.kind
+        if self._bar is None or self._bar[0] != key:
+            self._clear(size)
+            np.asarray(self._renderer.buffer_rgba())[:] = 0
+            self._draw_colour_bar(texts, bottom)
+            self._axes.figure.draw(self._renderer)
+            across, up = (math.ceil(length * size[1] / HEIGHT) for length in (2 * MARGIN + BAR[0], bottom + BAR_HEIGHT))
+            pixels = np.asarray(self._renderer.buffer_rgba())[-up:, :across].astype(np.float32)
+            self._bar = key, (pixels[..., 3:] / 255.0, pixels[..., :3])
+        return self._bar[1]
 
     def _clear(self, size: tuple[int, int]) -> None:
         """Remove what is drawn; open Axes that cover a picture of another size [pixels]."""
