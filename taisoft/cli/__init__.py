@@ -160,6 +160,10 @@ def command_parser() -> argparse.ArgumentParser:
     option("--out", metavar="DIR", help="folder for the pictures (default: drawn in the run's)")
     option("--overwrite", action="store_true", help="replace pictures already there")
     _add_pictures(option, "colouring of bodies, by a quantity that the run has kept")
+    option(
+        "--scale", type=float, metavar="X", help="upper end of the colour scale [the quantity's unit] (default: fits all frames)"
+    )
+    option("--look", metavar="FILE.toml", help="take background, lights and camera of a scene file")
     look = "NAME.colour='#rrggbb', NAME.opacity=NUMBER, or scene.background='#rrggbb'; may be repeated"
     option("--set", action="append", default=[], dest="assignments", metavar="NAME.KEY=VALUE", help=look)
 

@@ -9,10 +9,14 @@ from pathlib import Path
 from taisoft.cli import EXIT_SIGNAL, Signals
 from taisoft.cli.pictures import camera_of, picture_options, slowness
 from taisoft.cli.recording import has_bar, make_video
-from taisoft.errors import SceneError, reworded
+from taisoft.errors import OutputError, SceneError, reworded
 from taisoft.output.files import DRAWN_NAME, OutputFolder
+from taisoft.output.frames import FRAMES_NAME, VIDEO_NAME
 from taisoft.output.report import frame_rate
-from taisoft.scene.look import background_of, check_follow
+from taisoft.scene import checks
+from taisoft.scene.tables import Table
+from taisoft.scene.toml import TOP_KEYS, parsed
+from taisoft.scene.toml_look import read_look
 from taisoft.view.pictures import picture_writer
 from taisoft.view.states import StoredRun
 
@@ -20,23 +24,21 @@ from taisoft.view.states import StoredRun
 def draw(arguments: Namespace) -> int:
     """Draw the run and return the exit status. Bad input is refused before any file is written."""
     with Signals("ending with the pictures drawn so far") as signals:
-        run, out = StoredRun(arguments.scene), Path(arguments.out or Path(arguments.scene) / DRAWN_NAME)
+        with reworded(OutputError, raised=SceneError):
+            run, out = StoredRun(arguments.scene), Path(arguments.out or Path(arguments.scene) / DRAWN_NAME)
+            options, slow = picture_options(arguments), slowness(arguments)
+            run.check_colour(options.colour)
+            fps = frame_rate(run.folder) if arguments.video else 0.0
         if out.resolve() == run.folder.resolve():
-            raise SceneError(
-                f"--out {out}: it is the folder of the run itself: name another, or leave it out for {run.folder / DRAWN_NAME}"
-            )
-        options, slow = picture_options(arguments), slowness(arguments)
-        run.check_colour(options.colour)
-        if arguments.camera is not None:
-            run.scene.camera = camera_of(arguments.camera)
-            check_follow(run.scene.camera, run.scene.bodies)
-        for assignment in arguments.assignments:
-            _set(run, assignment)
-        fps = frame_rate(run.folder) if arguments.video else 0.0
+            raise SceneError(f"--out {out}: it is the folder of the run itself; without --out it is {run.folder / DRAWN_NAME}")
+        _set_look(run, arguments)
+        scale = None if arguments.scale is None else checks.number(arguments.scale, "--scale", above=0.0)
+        if scale is not None and options.colour == "body":
+            raise SceneError("--scale is that of a quantity, so it needs --colour")
         with closing(OutputFolder(out, arguments.overwrite)) as folder:
             signals.run_began()
             writer = picture_writer(folder.path, run.scene, replace(options, bar=has_bar(options.colour)))
-            writer.renderer.colouring.fix(map(run.state, run.frames))
+            writer.renderer.colouring.fix(map(run.state, run.frames), scale)
             drawn = 0
             with closing(writer):
                 for index in run.frames:
@@ -47,21 +49,29 @@ def draw(arguments: Namespace) -> int:
             if arguments.video and not signals.requested():
                 make_video(folder.path, fps / slow)
             folder.discard_stale()
-        print(f"pictures {out / 'frames'}/ ({drawn} of {len(run)} frames of {run.folder})")
+        print(f"pictures {out / FRAMES_NAME}/ ({drawn} of {len(run)} frames of {run.folder})")
+        if (out / VIDEO_NAME).exists():
+            print(f"film     {out / VIDEO_NAME}")
     return 0 if signals.number is None else EXIT_SIGNAL + signals.number
 
 
-def _set(run: StoredRun, assignment: str) -> None:
-    """Change the look as --set NAME.colour=VALUE, NAME.opacity=VALUE or scene.background=VALUE says. Raises SceneError."""
-    name, equals, text = (part.strip() for part in assignment.partition("="))
-    owner, _, key = name.rpartition(".")
-    value = text.strip("'\"")
-    with suppress(ValueError):
-        value = json.loads(text)
-    with reworded(SceneError, f"--set {assignment}: "):
-        if name == "scene.background":
-            run.scene.background = background_of(value)
-        elif equals and owner and key in ("colour", "opacity"):
-            run.paint(owner, **{key: value})
-        else:
-            raise SceneError("write NAME.colour='#rrggbb', NAME.opacity=NUMBER or scene.background='#rrggbb'")
+def _set_look(run: StoredRun, arguments: Namespace) -> None:
+    """Set the look that --look, --camera and --set give, in this order. Raises SceneError."""
+    if arguments.look is not None:
+        file = Path(arguments.look)
+        read_look(run, Table(file, "", parsed(file), TOP_KEYS))
+    if arguments.camera is not None:
+        run.camera = camera_of(arguments.camera)
+    for assignment in arguments.assignments:
+        name, equals, text = (part.strip() for part in assignment.partition("="))
+        owner, _, key = name.rpartition(".")
+        value = text.strip("'\"")
+        with suppress(ValueError):
+            value = json.loads(text)
+        with reworded(SceneError, f"--set {assignment}: "):
+            if name == "scene.background":
+                run.background = value
+            elif equals and owner and key in ("colour", "opacity"):
+                run.paint(owner, **{key: value})
+            else:
+                raise SceneError("write NAME.colour='#rrggbb', NAME.opacity=NUMBER or scene.background='#rrggbb'")

@@ -5,12 +5,13 @@ import sys
 import time
 from argparse import Namespace
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 from taisoft.cli.pictures import names_of, picture_options, slowness
 from taisoft.details import DETAILS, QUANTITIES
 from taisoft.errors import OutputError, SceneError
+from taisoft.nested import to_json
 from taisoft.output.files import RESULT_FILES, RESULT_FOLDERS, CheckpointWriter, OutputFolder
 from taisoft.output.frame_files import VTU_NAME, VtuWriter, cut_pvd
 from taisoft.output.frame_table import FrameTable
@@ -18,6 +19,7 @@ from taisoft.output.frames import FRAMES_NAME, ffmpeg_command, find_ffmpeg, pict
 from taisoft.output.report import body_records, write_report
 from taisoft.output.usd import UsdWriter
 from taisoft.records import RunReport
+from taisoft.scene.fingerprint import digest
 from taisoft.view.annotations import text_missing
 from taisoft.view.colouring import UNITS
 from taisoft.view.pictures import PictureOptions, open_pictures
@@ -173,7 +175,11 @@ class Recording:
         if shown.vtu:
             observers.members.append(VtuWriter(folder, sim.scene, self._first or 0, shown.errors))
         sampler, pictures = Sampler(sim.scene), None
+        look = digest([to_json([asdict(shown.picture), sampler.drawn.looks()])])
         if shown.pictures:
+            if self._first is not None and look != self._notes.get("look", look):
+                again = f"`taisoft draw {self.path}` draws all of them alike"
+                print(f"taisoft: pictures differ in size or look from those before frame {self._first}: {again}", file=sys.stderr)
             n_pictures = round((seconds - (0.0 if self._resumed is None else self._resumed["time"])) * (fps or 1.0 / sim.dt))
             options = replace(shown.picture, bar=has_bar(shown.picture.colour), kept=self._notes)
             pictures = open_pictures(folder, sampler.drawn, options, plots, n_pictures)
@@ -183,7 +189,7 @@ class Recording:
             states = StateWriter(folder, sampler, shown.keep, members, looks)
             observers.members.append(states)
             self._checkpoints.before.append(states.flush)
-        self._checkpoints.notes = lambda: {"fps": fps} | (pictures.kept(sim.time) if pictures else {})
+        self._checkpoints.notes = lambda: {"fps": fps, "look": look} | (pictures.kept(sim.time) if pictures else {})
         observers.members.append(self._checkpoints)
 
     def checkpoint(self, sim) -> None:

@@ -60,10 +60,11 @@ def lights_of(value) -> "tuple[Light, ...] | None":
     return lights
 
 
-def check_follow(camera: "Camera | None", bodies) -> None:
-    """Raise SceneError if a camera follows none of the bodies."""
+def check_follow(camera: "Camera | None", bodies) -> "Camera | None":
+    """Return a camera. Raises SceneError if it follows none of the bodies."""
     if camera is not None and camera.follow is not None:
         checks.index(camera.follow, [body.name for body in bodies], "camera: follow: no body")
+    return camera
 
 
 @guarded_record("light", "make a new Light")
@@ -106,9 +107,14 @@ class Camera:
             times = checks.array(self.times, "camera: times", ((max(checks.length(self.times), 1),),))
             if (np.diff(times) <= 0.0).any():
                 raise SceneError("camera: times must ascend")
+        elif any(np.ndim(getattr(self, name)) > least for name, least in (("position", 1), ("target", 1), ("fov", 0))):
+            raise SceneError("camera: key frames of position, target or fov need times [s]")
         k = () if times is None else (len(times),)
         values = {"position": ((3,), (*k, 3)), "target": ((3,), (*k, 3)), "fov": ((), k)}
-        values = {name: checks.array(getattr(self, name), f"camera: {name}", shapes) for name, shapes in values.items()}
+        values = {
+            name: checks.array(getattr(self, name), f"camera: {name}", (*dict.fromkeys(shapes),))
+            for name, shapes in values.items()
+        }
         if ((values["fov"] < 1.0) | (values["fov"] > 120.0)).any():
             raise SceneError(f"camera: fov must be from 1 to 120 degrees, not {value_text(self.fov)}")
         offsets = np.atleast_2d(values["position"] - values["target"])

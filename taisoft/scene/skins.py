@@ -57,7 +57,7 @@ def embed(self: "Body", surface: SurfaceMesh, contact: bool = False, colour=None
     if outside[far] > MAX_OUTSIDE:
         raise SceneError(
             f"{what}: vertex {far} lies outside of the body, by {outside[far]:.2g} times {self.extent}: at most {MAX_OUTSIDE:g} "
-            "is allowed"
+            "is allowed; place surface and mesh alike, by ts.place"
         )
     matrix = weight_matrix(nodes, weights, self.n_nodes)
     matrix.eliminate_zeros()

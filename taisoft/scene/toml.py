@@ -104,7 +104,7 @@ def read_scene(path, allow_outside: bool = False) -> tuple[Scene, dict]:
     try:
         with warnings.catch_warnings(record=True) as found:
             warnings.simplefilter("always")
-            return _read(Table(file, "", _parsed(file), TOP_KEYS), allow_outside)
+            return _read(Table(file, "", parsed(file), TOP_KEYS), allow_outside)
     finally:
         for warning in found:
             if issubclass(warning.category, UserWarning):
@@ -164,7 +164,7 @@ def _solver(**values) -> dict:
     return checks.check_solver(**{key: None if value == NONE_TEXT else value for key, value in values.items()})
 
 
-def _parsed(file: Path) -> dict:
+def parsed(file: Path) -> dict:
     """Return the file's tables. Raises SceneError with the line if the file cannot be read or is not TOML."""
     try:
         data = file.read_bytes()

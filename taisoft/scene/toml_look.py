@@ -13,12 +13,16 @@ LOOK_KEYS = ("background", "lights", "camera")
 
 def read_look(scene: Scene, tables: Table) -> None:
     """Set background, lights and camera of a scene whose bodies are there. Raises SceneError."""
-    with tables.located_errors("scene: "):
-        scene.background = tables.values.get("background")
-        if "lights" in tables:
-            scene.lights = [one.make(Light, "light: ") for one in tables.listed("lights", *arguments_of(Light))]
-        if "camera" in tables:
-            scene.camera = tables.made("camera", Camera, "camera: ")
+    if "background" in tables:
+        with tables.located_errors("scene: "):
+            scene.background = tables.values["background"]
+    if "lights" in tables:
+        lights = [one.make(Light, "light: ") for one in tables.listed("lights", *arguments_of(Light))]
+        with tables.located_errors("scene: "):
+            scene.lights = lights
+    if "camera" in tables:
+        scene.camera = tables.made("camera", Camera, "camera: ")
+        with tables.located_errors():
             check_follow(scene.camera, scene.bodies)
 
 

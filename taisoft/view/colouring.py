@@ -77,10 +77,11 @@ class Colouring:
         if kind == self.kind:
             self._peak, self.span = float(peak), float(span)
 
-    def fix(self, states: Iterable[DrawnState]) -> None:
-        """Keep one scale from now on, that of the largest values in these states."""
+    def fix(self, states: Iterable[DrawnState], end: float | None = None) -> None:
+        """Keep one scale from now on, up to this end, or for the largest values in these states."""
         if self.kind != "body":
-            self.span, self._is_fixed = round_up(max(MIN_SPAN[self.kind], *map(self._largest, states))), True
+            largest = max(MIN_SPAN[self.kind], *map(self._largest, states)) if end is None else 0.0
+            self.span, self._is_fixed = round_up(largest) if end is None else end - self.low, True
 
     def _largest(self, state: DrawnState) -> float:
         """Return the quantile of a state's values above the scale's lower end."""

@@ -25,7 +25,7 @@ PRESSURE_ARROW, IN_CHANNEL = 0.07, 0.4  # longest arrow over the scene's size, a
 MAX_STROKES, STROKE = 1500, 0.9  # strokes of fibres in a body; their length over the square root of a triangle's area
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, repr=False)
 class DrawnBody:
     """What is drawn of a body. Nodes are its own.
 
@@ -84,7 +84,7 @@ class DrawnBody:
         return drawn
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, repr=False)
 class DrawnScene:
     """What is drawn of a scene. Nodes are counted through all bodies where nothing else is said.
 
@@ -140,6 +140,12 @@ class DrawnScene:
             "pressed": [list(one) for one in self.pressed],
         }
 
+    def looks(self) -> dict:
+        """Return background, lights, camera, colours and opacities as plain data."""
+        given = self.plain()
+        ones = [[one["name"], one["colour"], one["opacity"]] for one in (*given["bodies"], *given["obstacles"])]
+        return {name: given[name] for name in ("background", "lights", "camera")} | {"ones": ones}
+
     @classmethod
     def from_plain(cls, given: dict) -> "DrawnScene":
         """Return the scene of `plain`."""
@@ -150,7 +156,7 @@ class DrawnScene:
         return drawn
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, repr=False)
 class DrawnState:
     """A scene at one moment.
 

@@ -12,15 +12,17 @@ from pathlib import Path
 
 import numpy as np
 
+from taisoft.attributes import Guarded
 from taisoft.errors import OutputError, TaisoftError, reason
 from taisoft.files import replacing
 from taisoft.nested import join_arrays, part_arrays
 from taisoft.output.background import BackgroundWriter
 from taisoft.output.files import make_folder
-from taisoft.scene.checks import index
-from taisoft.scene.look import Camera, colour_of, opacity_of
+from taisoft.scene import checks
+from taisoft.scene.look import Camera, check_follow, colour_of, opacity_of
+from taisoft.scene.scene import Scene
 from taisoft.view.colouring import checked_colour
-from taisoft.view.drawn import DrawnScene, DrawnState
+from taisoft.view.drawn import DrawnBody, DrawnScene, DrawnState
 from taisoft.view.offscreen import SIZE, Offscreen
 from taisoft.view.sampling import Sampler
 from taisoft.view.scene_view import LAYERS
@@ -67,12 +69,17 @@ class StateWriter:
                 stack.callback(one.close)
 
 
-class StoredRun:
+class StoredRun(Guarded):
     """A run in a folder, drawn again without computing.
 
-    folder: of `taisoft run --out`. scene: what is drawn of its scene, of which `background`, `lights` and `camera` can be set;
-    frames: numbers of its frames. Raises OutputError if there are no states, or they cannot be read.
+    folder: of `taisoft run --out`. frames: numbers of its frames. background, lights, camera: as of a `Scene`, to be set. Raises
+    OutputError if there are no states, or they cannot be read.
     """
+
+    _read_only = frozenset(("folder", "frames"))
+
+    def _label(self) -> str:
+        return "stored run"
 
     def __init__(self, folder: str | Path):
         self.folder = Path(folder)
@@ -80,10 +87,29 @@ class StoredRun:
         self.frames = sorted(int(path.stem) for path in states.glob("*.npz") if path.stem.isdecimal())
         if not self.frames or not (states / SCENE_NAME).exists():
             raise OutputError(
-                f"{states}: there are no states of a run: `taisoft run SCENE --out DIR` keeps them, but not with --keep none"
+                f"{states}: there are no states of a run, which `taisoft run` keeps with --out, but not with --keep none"
             )
         with _reading(states / SCENE_NAME):
-            self.scene = DrawnScene.from_plain(_read(states / SCENE_NAME)[0])
+            self._scene = DrawnScene.from_plain(_read(states / SCENE_NAME)[0])
+        self._background, self._lights, self._camera = self._scene.background, self._scene.lights, self._scene.camera
+        self._seal(StoredRun.__init__)
+
+    background, lights = Scene.background, Scene.lights
+    camera = checks.attribute(
+        "camera",
+        lambda self, value: check_follow(Scene._check_camera(self, value), self._scene.bodies),
+        "`Camera` of pictures; None: one that frames the start.",
+    )
+
+    @property
+    def bodies(self) -> list[DrawnBody]:
+        """What is drawn of the bodies."""
+        return self._scene.bodies
+
+    @property
+    def scene(self) -> DrawnScene:
+        """What is drawn of the scene, with the looks that have been set."""
+        return replace(self._scene, background=self.background, lights=self.lights, camera=self.camera)
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -99,21 +125,22 @@ class StoredRun:
         with _reading(path):
             given, arrays = _read(path)
             values = {name.removeprefix(f"{VALUES}/"): one for name, one in arrays.items() if name.startswith(f"{VALUES}/")}
-            return DrawnState(self.scene, displacement=arrays[DISPLACEMENT], values=values, **given)
+            return DrawnState(self._scene, displacement=arrays[DISPLACEMENT], values=values, **given)
 
     def check_colour(self, kind: str) -> str:
         """Return the name of a colouring. Raises OutputError if it is unknown, or the run has not kept what it needs."""
         kept = self.state(self.frames[0]).values
         if checked_colour(kind) != "body" and kind not in kept:
             has = f"has kept {', '.join(kept)}" if kept else "has kept positions alone"
-            raise OutputError(f"{self.folder}: colour {kind!r} cannot be drawn: the run {has}; run it again with --keep {kind}")
+            again = f"run it again with --keep {','.join([*kept, kind])}"
+            raise OutputError(f"{self.folder}: colour {kind!r} cannot be drawn: the run {has}; {again}")
         return kind
 
     def paint(self, name: str, colour=None, opacity: float | None = None) -> None:
         """Give a body or an obstacle another colour or opacity, as of `Scene.add_body`. Raises SceneError."""
-        scene, what = self.scene, f"{name!r}"
+        scene, what = self._scene, f"{name!r}"
         ones = [*scene.bodies, *scene.obstacles]
-        k = index(name, [one.name for one in ones], "no body or obstacle")
+        k = checks.index(name, [one.name for one in ones], "no body or obstacle")
         given = {} if colour is None else {"colour": colour_of(colour, f"{what}: colour")}
         given |= {} if opacity is None else {"opacity": opacity_of(opacity, f"{what}: opacity")}
         owner, at = (scene.bodies, k) if k < len(scene.bodies) else (scene.obstacles, k - len(scene.bodies))

@@ -37,17 +37,35 @@ def test_the_same_options_give_the_same_bytes(finished, capsys):
 
 def test_another_look(finished, tmp_path):
     (tmp_path / "camera.toml").write_text("[camera]\nposition = [[0, 0, 9], [0, 0, 18]]\ntimes = [0, 0.1]\n")
-    look = ("--camera", tmp_path / "camera.toml", "--set", "beam.colour='#00ff00'", "--layers", "none")
+    (tmp_path / "look.toml").write_text('background = "#0000ff"\n[camera]\nposition = [5, 5, 5]\n')
+    look = (
+        "--look",
+        tmp_path / "look.toml",
+        "--camera",
+        tmp_path / "camera.toml",
+        "--set",
+        "beam.colour='#00ff00'",
+        "--layers",
+        "none",
+    )
     assert draw(finished, "--out", tmp_path / "green", *look, *SIZE) == 0
     first, last = (decode(pictures(tmp_path / "green")[name]).astype(int) for name in ("00000.png", "00003.png"))
     sizes = [(one[..., 1] - one[..., 0] > 60).sum() for one in (first, last)]
+    assert first[0, 0].tolist() == [0, 0, 255]
     assert sizes[0] == pytest.approx(4 * sizes[1], rel=0.3), "the camera moves back to twice the distance"
 
 
 @pytest.mark.parametrize(
     "arguments, status, text",
     [
-        (("--colour", "slip"), 3, "colour 'slip' cannot be drawn: the run has kept stress, speed; run it again with --keep slip"),
+        (
+            ("--colour", "slip"),
+            2,
+            "colour 'slip' cannot be drawn: the run has kept stress, speed; run it again with --keep stress,speed,slip",
+        ),
+        (("--scale", "2"), 2, "--scale is that of a quantity, so it needs --colour"),
+        (("--camera", "position = [[0, 0, 9], [0, 0, 8]]"), 2, "camera: key frames of position, target or fov need times [s]"),
+        (("--look", "none.toml"), 2, "none.toml: the file cannot be read: No such file"),
         (("--camera", "position = [0, 0, 0]"), 2, "camera.position and target must differ"),
         (("--camera", "place = [0, 0, 0]"), 2, "place"),
         (("--camera", "position = 3 2"), 2, "--camera position = 3 2: write a .toml file, or keys as in"),
@@ -74,7 +92,7 @@ def test_the_run_itself_stays(finished, tmp_path, capsys):
     assert (
         draw(finished, "--out", finished, "--overwrite") == 2 and "it is the folder of the run itself" in capsys.readouterr().err
     )
-    assert draw(tmp_path) == 3 and "there are no states of a run" in capsys.readouterr().err
+    assert draw(tmp_path) == 2 and "there are no states of a run" in capsys.readouterr().err
     assert pictures(finished) == before
 
 

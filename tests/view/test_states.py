@@ -72,6 +72,9 @@ def test_another_look(stored):
     assert (np.abs(painted - before).max(axis=2) > 20).mean() > 0.01
     turned = run.picture(5, SIZE, "speed", ts.Camera((9, 1, 0), (0, 0, 0)))
     assert not np.array_equal(turned, run.picture(None, SIZE, "speed")) and run.scene.camera is None
+    run.background, run.lights, run.camera = "#102030", ts.Light((0, -1, 0)), ts.Camera((9, 1, 0), follow="one")
+    dark = run.picture(0, SIZE)
+    assert (np.abs(dark[0, 0] - (16.0, 32.0, 48.0)) < 2).all() and len(run.lights) == 1
 
 
 def test_refusals(stored, tmp_path):
@@ -80,13 +83,20 @@ def test_refusals(stored, tmp_path):
         (
             lambda: run.picture(0, SIZE, "slip"),
             OutputError,
-            "colour 'slip' cannot be drawn: the run has kept speed, stress; .* --keep slip$",
+            "colour 'slip' cannot be drawn: the run has kept speed, stress; .* --keep speed,stress,slip$",
         ),
         (lambda: run.picture(0, SIZE, "slop"), OutputError, "colour 'slop' is unknown"),
         (lambda: run.state(2), OutputError, "there is no frame 2: they are 0 to 5$"),
         (lambda: run.paint("tow", "#ffffff"), SceneError, "no body or obstacle is called 'tow' .did you mean two"),
         (lambda: run.paint("two", "red"), SceneError, "^'two': colour must be '#rrggbb'"),
         (lambda: run.paint("lid", opacity=0), SceneError, "^'lid': opacity must be at least 0.02"),
+        (lambda: setattr(run, "background", "red"), SceneError, "^scene: background must be '#rrggbb'"),
+        (
+            lambda: setattr(run, "camera", ts.Camera((1, 0, 0), follow="tow")),
+            SceneError,
+            "camera: follow: no body is called 'tow'",
+        ),
+        (lambda: setattr(run, "backgroud", "#ffffff"), SceneError, "no attribute 'backgroud'; did you mean 'background'"),
         (lambda: StoredRun(tmp_path / "none"), OutputError, "none/states: there are no states of a run"),
     ):
         with pytest.raises(error, match=text):
