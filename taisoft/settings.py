@@ -19,8 +19,7 @@ WITH_MULTIPLIERS = ("implicit_euler", "bdf2")
 CONTACT_SOLVERS = ("auto", *EXPLICIT_CONTACT, *IMPLICIT_CONTACT)
 
 
-@guarded_record("settings", "call sim.rebuild({name}=...)")
-@dataclasses.dataclass(frozen=True)
+@guarded_record("settings", "call sim.rebuild({name}=...)", eq=True)
 class Settings:
     """Arguments of a Simulator besides the scene; tolerances are relative, None is the default or adaptive."""
 

@@ -7,7 +7,7 @@ Source: Hu, Schneider, Wang, Zorin, Panozzo 2020, Fast tetrahedral meshing in th
 
 import tempfile
 import warnings
-from dataclasses import dataclass, field
+from dataclasses import field
 from importlib.util import find_spec
 from numbers import Real
 from pathlib import Path
@@ -36,7 +36,6 @@ ENVELOPE = 0.1  # default envelope over the edge length
 
 
 @guarded_record("surface", MAKE_ANOTHER, MeshAttributeError)
-@dataclass(frozen=True, eq=False)
 class SurfaceMesh:
     """Triangles in space, checked and read-only.
 
@@ -64,8 +63,6 @@ class SurfaceMesh:
             t, k = bad[0]
             raise MeshError(f"{self.source}: triangle {t}: vertex {triangles[t, k]} does not exist ({len(vertices)} vertices)")
         triangles, n = triangles.astype(np.int64), len(triangles)
-        for array in (vertices, triangles):
-            array.setflags(write=False)
         texture = {"uvs": checked_uvs(self.uvs, n, self._error), "subsets": checked_subsets(self.subsets, n, self._error)}
         self.__dict__.update(vertices=vertices, triangles=triangles, **texture)  # the only way to store values in a frozen record
 

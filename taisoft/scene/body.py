@@ -2,7 +2,6 @@
 
 import warnings
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from types import MappingProxyType
 from typing import ClassVar
 
@@ -40,7 +39,6 @@ _SET["cavity"] = f"call sim.set_cavity(name, value) for an existing one; otherwi
 
 
 @guarded_record("constraint", "add another one by body.fix or body.move")
-@dataclass(frozen=True, eq=False)
 class Constraint:
     """Nodes prescribed along some axes: at their start position, or at that plus a time-dependent displacement."""
 
@@ -48,9 +46,6 @@ class Constraint:
     axes: np.ndarray  #: (3,) bool
     path: Callable | None = None  #: t [s] -> displacement (3,) or (k,3) [m], None once released; no path: the nodes stay
     where: Callable | None = None  #: the function that selected the nodes, if any: it can select again on another mesh
-
-    def __post_init__(self):
-        checks.store(self, nodes=self.nodes, axes=self.axes)
 
 
 def tet_number(name: str, doc: str) -> property:

@@ -11,7 +11,6 @@ import numpy as np
 import scipy
 
 from taisoft.attributes import guarded_record
-from taisoft.display import short_repr
 from taisoft.errors import SceneError
 from taisoft.scene import checks
 
@@ -20,7 +19,6 @@ PARALLEL = 1e-12  # sine of the angle between two axes below which they count as
 
 
 @guarded_record("key frames", "make new KeyFrames")
-@dataclass(frozen=True, eq=False)
 class KeyFrames:
     """A path for `Body.move` and `Scene.add_obstacle`. Calling it with t [s] returns (translation (3,) [m], rotation (3,3)).
 
@@ -36,8 +34,6 @@ class KeyFrames:
     smooth: bool = False  #: at rest at every key: a fraction s of the time between two keys covers s^2 (3 - 2 s) of the distance
     release: bool = False  #: prescribed nodes are released at the last time
     values: np.ndarray | None = None  #: (k,) of a load that is one number, in its unit; excludes all but times and smooth
-
-    __repr__ = short_repr
 
     def __post_init__(self):
         what = "key frames"

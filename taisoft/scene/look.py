@@ -1,13 +1,11 @@
 """How a scene looks, which changes nothing in a simulation: colours, opacity, lights, and the camera."""
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 import scipy
 
 from taisoft.attributes import guarded_record
-from taisoft.display import short_repr
 from taisoft.errors import SceneError, value_text
 from taisoft.mesh.placing import FROM_Y_UP, UP
 from taisoft.scene import checks
@@ -67,15 +65,12 @@ def check_follow(camera: "Camera | None", bodies) -> None:
 
 
 @guarded_record("light", "make a new Light")
-@dataclass(frozen=True, eq=False)
 class Light:
     """Light from far away, of a scene's `lights`. Raises SceneError."""
 
     direction: np.ndarray  #: (3,) in which it shines, of any length
     strength: float = 0.7  #: fraction of its colour that a face perpendicular to it shows
     colour: np.ndarray | str = (1.0, 1.0, 1.0)  #: sRGB, (3,) in [0, 1] or "#rrggbb"
-
-    __repr__ = short_repr
 
     def __post_init__(self):
         direction = checks.array(self.direction, "light: direction", ((3,),))
@@ -85,7 +80,6 @@ class Light:
 
 
 @guarded_record("camera", "make a new Camera")
-@dataclass(frozen=True, eq=False)
 class Camera:
     """From where pictures and films show a scene: `scene.camera`. With times, positions, targets and fields of view are key
     frames, between which the camera turns about its target on a smooth curve. Raises SceneError.
@@ -97,8 +91,6 @@ class Camera:
     fov: float | np.ndarray = 45.0  #: vertical field of view [deg], or (k,)
     times: np.ndarray | None = None  #: (k,) ascending [s]; before the first and after the last the camera stays
     follow: str | None = None  #: name of a body with whose mean displacement the camera moves along
-
-    __repr__ = short_repr
 
     def __post_init__(self):
         times = None

@@ -12,7 +12,6 @@ from typing import ClassVar
 import numpy as np
 
 from taisoft.attributes import guarded_record
-from taisoft.display import short_repr
 from taisoft.errors import MeshError, SceneError, reason, reworded, value_text
 from taisoft.mesh.shapes import box_mesh
 from taisoft.mesh.surface_mesh import SurfaceMesh
@@ -59,7 +58,6 @@ class Shape:
 
 
 @guarded_record("half-space", MAKE_ANOTHER)
-@dataclass(frozen=True, eq=False)
 class HalfSpace(Shape):
     """All points x with (x - point) . normal <= 0. Raises SceneError for a normal without length."""
 
@@ -83,7 +81,6 @@ class HalfSpace(Shape):
 
 
 @guarded_record("sphere", MAKE_ANOTHER)
-@dataclass(frozen=True, eq=False)
 class Sphere(Shape):
     """A solid sphere. Raises SceneError unless its radius is above 0."""
 
@@ -101,7 +98,6 @@ class Sphere(Shape):
 
 
 @guarded_record("box", MAKE_ANOTHER)
-@dataclass(frozen=True, eq=False)
 class Box(Shape):
     """An axis-aligned box. Raises SceneError unless its half extents are above 0."""
 
@@ -126,7 +122,6 @@ class Box(Shape):
 
 
 @guarded_record("capsule", MAKE_ANOTHER)
-@dataclass(frozen=True, eq=False)
 class Capsule(Shape):
     """All points within a radius of the segment from a to b. Raises SceneError unless the radius is above 0 and a is not b."""
 
@@ -155,7 +150,6 @@ class Capsule(Shape):
 
 
 @guarded_record("mesh obstacle", MAKE_ANOTHER)
-@dataclass(frozen=True, eq=False)
 class MeshObstacle(Shape):
     """Triangles whose normals point out of the solid; they may be open, and inward normals bound a cavity.
 
@@ -167,7 +161,6 @@ class MeshObstacle(Shape):
     triangles: np.ndarray  #: (t,3) int64
     kind: ClassVar[int] = 4
     word: ClassVar[str] = "mesh obstacle"
-    __repr__ = short_repr
 
     def __post_init__(self):
         vertices = checks.array(self.vertices, "mesh obstacle: vertices", ((max(checks.length(self.vertices), 3), 3),))
@@ -219,7 +212,6 @@ def surface_numbers(friction, restitution, what: str) -> tuple[float, float]:
 @guarded_record(
     "obstacle", "scene.set_contact sets friction and restitution of a pair, sim.set_contact in a simulation, and a path moves it"
 )
-@dataclass(frozen=True, eq=False)
 class Obstacle:
     """A shape in a scene; made by `Scene.add_obstacle`.
 

@@ -40,7 +40,6 @@ def import_mujoco() -> Any:
 
 
 @guarded_record("robot", "load it again, with other arguments")
-@dataclass(frozen=True, eq=False)
 class Robot:
     """A robot as MuJoCo compiled it; made by `Robot.load`. Several scenes, and one scene several times, may hold it."""
 

@@ -3,7 +3,6 @@
 Each vertex moves as the point of the body's elements at which it lies at rest. `embed` is a method of `Body`.
 """
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -23,7 +22,6 @@ MAX_OUTSIDE = 0.5  # heights of the nearest tet by which a vertex may lie outsid
 
 
 @guarded_record("skin", "add another body")
-@dataclass(frozen=True, eq=False)
 class Skin:
     """A surface that rides in the tets of a body."""
 
