@@ -73,10 +73,16 @@ class Guarded:
                 value.setflags(write=False)
         self.__dict__["_frozen"] = True
 
-    def _check_open(self, call: str) -> None:
-        """Raise the error of a call that would change a frozen object."""
+    def _check_open(self, call: str) -> str:
+        """Return the start of messages of a call that changes the object. Raises the error of the call if it is frozen."""
         if self._frozen:
             raise self._frozen_error(call)
+        return f"{self._label()}: {call}"
+
+    def _add(self, items: list, one):
+        """Append one to a guarded list of the object, and return it."""
+        list.append(items, one)
+        return one
 
     def _frozen_error(self, name: str) -> Exception:
         call = callable(_declared(type(self), name))

@@ -150,11 +150,14 @@ def name(value, what: str, taken: list[str]) -> str:
     return value
 
 
-def free_name(value, kind: str, taken: list[str]) -> str:
-    """Return value as a `name` of a scene's kind of thing, or, if it is None, the first free one of kind0, kind1 and so on."""
+def free_name(value, kind: str, taken: list[str], what: str = "") -> str:
+    """Return value as a `name` of a scene's kind of thing, or, if it is None, the first free one of kind0, kind1 and so on.
+
+    what: start of messages, by default that of the scene.
+    """
     if value is None:
         value = next(free for free in (f"{kind}{i}" for i in range(len(taken) + 1)) if free not in taken)
-    return name(value, f"scene: {kind} name", taken)
+    return name(value, what or f"scene: {kind} name", taken)
 
 
 def axes(value, what: str) -> np.ndarray:

@@ -46,9 +46,7 @@ def add_spring(
     if rest_length is not None:
         rest_length = checks.number(rest_length, f"{what}: rest_length", minimum=0.0, unit="m")
     damping = checks.number(damping, f"{what}: damping", minimum=0.0, unit="N s/m")
-    spring = Spring(name, points, stiffness, rest_length, damping)
-    list.append(self.springs, spring)
-    return spring
+    return self._add(self.springs, Spring(name, points, stiffness, rest_length, damping))
 
 
 def add_tendon(
@@ -78,8 +76,7 @@ def add_tendon(
     load = value_or_path(force if given == "force" else length, what, given, ((),))
     tendon = Tendon(name, made, **load, given=given, stiffness=stiffness)
     check_tendon(tendon, tendon.path(0.0) if tendon.value is None else tendon.value, what)
-    list.append(self.tendons, tendon)
-    return tendon
+    return self._add(self.tendons, tendon)
 
 
 def attach(
@@ -115,8 +112,7 @@ def attach(
     attachment = Attachment(name, body.name, nodes, owner.name, stiffness, damping, where if callable(where) else None)
     if isinstance(owner, Body):
         locate_nodes(self, attachment)
-    list.append(self.attachments, attachment)
-    return attachment
+    return self._add(self.attachments, attachment)
 
 
 def check_connections(scene: "Scene") -> None:

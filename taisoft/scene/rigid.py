@@ -208,8 +208,7 @@ class RigidBody(Body):
         axes: the directions, such as "y" or "xz", that no point of it moves along; rotations: the axes that it then cannot turn
         about, which are all that would move a point along `axes`; None for just these. Raises SceneError for other rotations.
         """
-        self._check_open("fix")
-        what = f"{self._label()}: fix"
+        what = self._check_open("fix")
         mask = checks.axes(axes, what)
         held = "".join(axis for k, axis in enumerate("xyz") if np.delete(mask, k).any())
         if rotations is not None and (not isinstance(rotations, str) or sorted(rotations) != list(held)):

@@ -284,7 +284,7 @@ class Scene(Guarded):
         shape = order, quadrature_degree, collision, dilatation, fibres, curve
         body = Body(name, mesh, material, position, velocity, *shape, **numbers)
         body.colour, body.opacity = colour, opacity
-        list.append(self.bodies, body)
+        self._add(self.bodies, body)
         body.warn_locking(stacklevel=2)
         body.warn_bending(stacklevel=2)
         return body
@@ -315,8 +315,7 @@ class Scene(Guarded):
         name = self._free_name(name, "rigid")
         body = RigidBody(name, mesh, density, position, velocity, angular_velocity, friction, restitution, young)
         body.colour, body.opacity = colour, opacity
-        list.append(self.bodies, body)
-        return body
+        return self._add(self.bodies, body)
 
     def add_obstacle(
         self,
@@ -335,9 +334,8 @@ class Scene(Guarded):
         or `KeyFrames`. colour, opacity: as for `add_body`. Raises SceneError.
         """
         self._check_open("add_obstacle")
-        obstacle = Obstacle(shape, self._free_name(name, "obstacle"), friction, restitution, path, colour, opacity)
-        list.append(self.obstacles, obstacle)
-        return obstacle
+        name = self._free_name(name, "obstacle")
+        return self._add(self.obstacles, Obstacle(shape, name, friction, restitution, path, colour, opacity))
 
     def add_ground(
         self,

@@ -38,8 +38,7 @@ def embed(self: "Body", surface: SurfaceMesh, contact: bool = False, colour=None
     touched; it must then be closed, and its vertices follow the nodes of the tets in all results. colour, opacity: set those of
     the body. Raises SceneError.
     """
-    self._check_open("embed")
-    what = f"{self._label()}: embed"
+    what = self._check_open("embed")
     surface = as_surface(surface)
     if not isinstance(surface, SurfaceMesh):
         raise SceneError(f"{what}: surface must be a SurfaceMesh (see ts.read_surface), not {type(surface).__name__}")
