@@ -9,7 +9,6 @@ import tempfile
 import warnings
 from dataclasses import field
 from importlib.util import find_spec
-from numbers import Real
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +24,7 @@ from taisoft.mesh.stl import read_stl
 from taisoft.mesh.tet_mesh import TetMesh, checked_array
 from taisoft.mesh.texture import checked_subsets, checked_uvs, subsets_of, transferred
 from taisoft.mesh.topology import Faces, connected_pieces, crack_widths, linked_groups, merge_labels, triangle_edges
+from taisoft.scene.checks import number
 
 READERS = {".obj": read_obj, ".stl": read_stl, ".ply": read_ply, ".off": read_off}
 FORMATS = tuple(READERS)
@@ -195,10 +195,8 @@ def as_surface(mesh, weld: float = 0.0):
 def clean_surface(surface: SurfaceMesh, weld: float) -> SurfaceMesh:
     """Return the surface, welded [m], without degenerate and duplicate triangles; issue its warnings, at the caller's caller."""
     name, points, triangles = surface.source, surface.vertices, surface.triangles
-    if isinstance(weld, bool) or not isinstance(weld, Real) or not 0.0 <= weld < np.inf:
-        raise MeshError(f"{name}: weld must be a distance of at least 0 m, not {weld!r}")
     notes = list(surface.warnings)
-    labels = merge_labels(points, float(weld))
+    labels = merge_labels(points, number(weld, f"{name}: weld", minimum=0.0, unit="m", error=MeshError))
     first = np.unique(labels, return_index=True)[1]
     if len(first) < len(points):
         notes.append(f"{len(points) - len(first)} of {len(points)} vertices were welded to another one")
@@ -233,8 +231,9 @@ def tetrahedralize(surface: SurfaceMesh, edge_length: float | None = None, envel
     if not isinstance(surface, SurfaceMesh):
         raise MeshError(f"tetrahedralize needs a SurfaceMesh (see read_surface), not {type(surface).__name__}")
     name, diagonal = surface.source, float(np.linalg.norm(np.ptp(surface.vertices, axis=0)))
-    edge_length = _checked_length(name, "edge_length", edge_length, diagonal / EDGES_PER_DIAGONAL, diagonal)
-    envelope = _checked_length(name, "envelope", envelope, ENVELOPE * edge_length, diagonal)
+    lengths = {"above": 0.0, "below": diagonal, "unit": "m, the surface's diagonal", "error": MeshError}
+    edge_length = diagonal / EDGES_PER_DIAGONAL if edge_length is None else number(edge_length, f"{name}: edge_length", **lengths)
+    envelope = ENVELOPE * edge_length if envelope is None else number(envelope, f"{name}: envelope", **lengths)
     if find_spec("wildmeshing") is None:
         raise MeshError(f"{name}: tetrahedralize needs the package wildmeshing: pip install 'taisoft[mesh]'")
     faults = surface.faults()
@@ -264,14 +263,6 @@ def tetrahedralize(surface: SurfaceMesh, edge_length: float | None = None, envel
         text += "; the closing surface may be rough and bulge beyond the envelope"
         warnings.warn(f"{name}: {text}", UserWarning, stacklevel=2)
     return mesh
-
-
-def _checked_length(name: str, what: str, value, default: float, diagonal: float) -> float:
-    if value is None:
-        return default
-    if isinstance(value, bool) or not isinstance(value, (int, float, np.number)) or not 0.0 < value < diagonal:
-        raise MeshError(f"{name}: {what} must be a length above 0 and below the diagonal, {diagonal:.4g} m, not {value!r}")
-    return float(value)
 
 
 def _run_mesher(name: str, vertices: np.ndarray, triangles: np.ndarray, length: float, envelope: float):

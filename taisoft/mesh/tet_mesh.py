@@ -12,11 +12,11 @@ from collections.abc import Callable
 import numpy as np
 
 from taisoft.attributes import Guarded, MeshAttributeError
-from taisoft.errors import MeshError, listed, one_line
+from taisoft.errors import MeshError, listed
 from taisoft.machine import require
 from taisoft.mesh.fibres import FIBRES, checked_fibres
 from taisoft.mesh.quality import edge_lengths, mean_ratio
-from taisoft.mesh.regions import checked_names, checked_regions, region_id, region_text
+from taisoft.mesh.regions import as_array, checked_names, checked_regions, region_id, region_text
 from taisoft.mesh.texture import checked_subsets, checked_uvs
 from taisoft.mesh.topology import (
     Faces,
@@ -39,10 +39,7 @@ COINCIDENT = 1e-9  # vertices closer than this times the mesh's diagonal are coi
 
 def checked_array(values, what: str, width: int, kinds: str, kinds_text: str, error: Callable[[str], MeshError]) -> np.ndarray:
     """Return values as an array (n, width) of these kinds with at least one row. error: makes an error of its text."""
-    try:
-        array = np.asarray(values)
-    except (ValueError, TypeError, OverflowError) as reason:
-        raise error(f"{what} must be an array of {kinds_text}: {one_line(str(reason))}") from reason
+    array = as_array(values, what, kinds_text, error)
     if array.size == 0:
         raise error(f"no {what} found")
     if array.dtype.kind not in kinds:

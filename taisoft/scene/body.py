@@ -142,9 +142,6 @@ class Body(Guarded):
     def _label(self) -> str:
         return f"body {self.name!r}"
 
-    def _check_position(self, value) -> np.ndarray:
-        return checks.array(value, f"{self._label()}: position", ((3,),))
-
     def _check_velocity(self, value) -> np.ndarray:
         return checks.array(value, f"{self._label()}: velocity", ((3,), (self.n_nodes, 3)))
 
@@ -153,17 +150,11 @@ class Body(Guarded):
             raise SceneError(f"{self._label()}: collision: an embedded surface has no distance field")
         return checks.choice(value, f"{self._label()}: collision", CONTACT_MODES)
 
-    position = checks.attribute("position", _check_position, "Initial translation (3,) [m].")
-    velocity = checks.attribute("velocity", _check_velocity, "Initial velocity (3,) or (n,3) [m/s].")
-    collision = checks.attribute("collision", _check_collision, "Contact geometry, one of CONTACT_MODES.")
-    colour = checks.attribute(
-        "colour",
-        lambda self, value: colour_or_none(value, f"{self._label()}: colour"),
-        'sRGB (3,) in [0, 1], also set as "#rrggbb"; None: one of the palette.',
-    )
-    opacity = checks.attribute(
-        "opacity", lambda self, value: opacity_of(value, f"{self._label()}: opacity"), "Of its surface: 1 hides what is behind."
-    )
+    position = checks.attribute("position", checks.vector, "Initial translation (3,) [m].")
+    velocity = checks.attribute("velocity", None, "Initial velocity (3,) or (n,3) [m/s].")
+    collision = checks.attribute("collision", None, "Contact geometry, one of CONTACT_MODES.")
+    colour = checks.attribute("colour", colour_or_none, 'sRGB (3,) in [0, 1], also set as "#rrggbb"; None: one of the palette.')
+    opacity = checks.attribute("opacity", opacity_of, "Of its surface: 1 hides what is behind.")
 
     @property
     def rest_positions(self) -> np.ndarray:
@@ -255,7 +246,7 @@ class Body(Guarded):
 
     def check(self) -> None:
         """Raise SceneError if in-place changes made the arrays of position or velocity invalid, or its law is another one now."""
-        self._check_position(self.position)
+        checks.vector(self.position, f"{self._label()}: position")
         self._check_velocity(self.velocity)
         for material in self.composition.materials.values():
             material.check_law(self._label())

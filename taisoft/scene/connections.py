@@ -235,7 +235,7 @@ def _point(scene: "Scene", end, what: str) -> Point:
         rows = owner.selectable
         node = rows.start + checks.whole(end[1], f"{what}: the node", range(rows.stop - rows.start))
         return Point(owner.name, owner.rest_positions[node].copy())
-    position = checks.array(end[1], f"{what}: the point", ((3,),))
+    position = checks.vector(end[1], f"{what}: the point")
     check_inside(owner, position, f"{what}: the point")
     return Point(owner.name, position)
 

@@ -52,7 +52,7 @@ class Shape:
 
     def _check(self, *vectors: str) -> None:
         """Validate these (3,) fields, and the radius if there is one."""
-        checks.store(self, **{field: checks.array(getattr(self, field), f"{self.word}: {field}", ((3,),)) for field in vectors})
+        checks.store(self, **{field: checks.vector(getattr(self, field), f"{self.word}: {field}") for field in vectors})
         if hasattr(self, "radius"):
             checks.store(self, radius=checks.number(self.radius, f"{self.word}: radius", above=0.0, unit="m"))
 
@@ -278,7 +278,7 @@ def checked_pose(value, t: float, what: str) -> tuple[np.ndarray, np.ndarray]:
         translation, rotation = value
     except Exception as error:
         raise SceneError(f"{what} must give (translation, rotation) and failed at t = {t:g}: {reason(error)}") from error
-    translation = checks.array(translation, f"{what}'s translation at t = {t:g}", ((3,),))
+    translation = checks.vector(translation, f"{what}'s translation at t = {t:g}")
     rotation = checks.array(rotation, f"{what}'s rotation at t = {t:g}", ((3, 3),))
     with np.errstate(over="ignore", invalid="ignore"):
         rigid = np.abs(rotation.T @ rotation - np.eye(3)).max() <= RIGID_TOLERANCE and np.linalg.det(rotation) > 0

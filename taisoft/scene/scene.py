@@ -7,6 +7,7 @@ import copy
 import difflib
 import math
 from collections.abc import Callable, Mapping
+from functools import partial
 
 import numpy as np
 
@@ -64,7 +65,7 @@ class Scene(Guarded):
     def __init__(self, gravity=None, up: str | None = None):
         """gravity: (3,) [m/s^2], by default 9.81 downwards. up: axis that points up, "y" or "z"; by default "z" if gravity acts
         exactly along -z, else "y". Raises SceneError for other values."""
-        x, y, z = self._check_gravity((0.0, 0.0, 0.0) if gravity is None else gravity)
+        x, y, z = np.zeros(3) if gravity is None else checks.vector(gravity, "scene: gravity")
         self.up = up if up is not None else "z" if x == y == 0.0 > z else "y"
         self.gravity = 0.0 - 9.81 * UP[self.up] if gravity is None else gravity
         self.bodies: list[Body] = []
@@ -80,49 +81,37 @@ class Scene(Guarded):
         self._start: Scene | None = None  # see `snapshot`
         self._seal(Scene.__init__)
 
-    def _check_gravity(self, value) -> np.ndarray:
-        return checks.array(value, "scene: gravity", ((3,),))
-
-    def _check_collision(self, value) -> CollisionSettings:
-        if not isinstance(value, CollisionSettings):
-            raise SceneError(f"scene: collision must be CollisionSettings, not {type(value).__name__}")
-        return value
-
-    def _check_camera(self, value) -> Camera | None:
-        if value is not None and not isinstance(value, Camera):
-            raise SceneError(f"scene: camera must be a Camera or None, not {type(value).__name__}")
-        return value
-
-    gravity = checks.attribute("gravity", _check_gravity, "Acceleration of gravity (3,) [m/s^2].")
+    gravity = checks.attribute("gravity", checks.vector, "Acceleration of gravity (3,) [m/s^2].")
     up = checks.attribute(
         "up",
-        lambda _, value: checks.choice(value, "scene: up", tuple(UP)),
+        partial(checks.choice, allowed=tuple(UP)),
         'Axis that points up, "y" or "z", in pictures, in USD and for `add_ground`; setting it turns nothing in the scene.',
     )
-    collision = checks.attribute("collision", _check_collision, "Settings of the contact search.")
+    collision = checks.attribute("collision", partial(checks.instance, kind=CollisionSettings), "Settings of the contact search.")
     allow_initial_overlap = checks.attribute(
         "allow_initial_overlap",
-        lambda _, value: checks.flag(value, "scene: allow_initial_overlap"),
+        checks.flag,
         "Whether initial overlap is allowed. Otherwise a Simulator refuses overlaps deeper than 1e-6 of the smaller size.",
     )
     contact_forces = checks.attribute(
         "contact_forces",
-        lambda _, value: checks.flag(value, "scene: contact_forces"),
+        checks.flag,
         "Whether contacts exert forces. Otherwise bodies pass through each other, and contacts are detected only on request.",
     )
-
     background = checks.attribute(
         "background",
-        lambda _, value: background_of(value),
+        lambda value, _: background_of(value),
         'sRGB colours (2,3) at the top and the bottom of pictures, also set as one for both, or as "#rrggbb"; None: light grey.',
     )
     lights = checks.attribute(
         "lights",
-        lambda _, value: lights_of(value),
+        lambda value, _: lights_of(value),
         "Lights of pictures and USD, a tuple of `Light`, beside that of the sky; None: two that move with the camera.",
     )
     camera = checks.attribute(
-        "camera", _check_camera, "`Camera` of pictures, films and USD; None: one that frames the bodies and steps back from them."
+        "camera",
+        partial(checks.instance, kind=Camera, optional=True),
+        "`Camera` of pictures, films and USD; None: one that frames the bodies and steps back from them.",
     )
 
     def pushes(self, self_collision: bool) -> bool:
@@ -175,7 +164,7 @@ class Scene(Guarded):
 
     def check(self) -> None:
         """Raise SceneError if in-place changes made an array, such as gravity, invalid."""
-        self._check_gravity(self.gravity)
+        checks.vector(self.gravity, "scene: gravity")
         for body in self.bodies:
             body.check()
         names: set[str] = set()

@@ -263,7 +263,7 @@ def selection(table: Table, key: str):
         box = choice.table("box", ["min", "max"], ["min", "max"])
         corners = {end: box.checked(end) for end in ("min", "max")}
         with box.located_errors():
-            low, high = (checks.array(value, end, ((3,),)) for end, value in corners.items())
+            low, high = (checks.vector(value, end) for end, value in corners.items())
         if not (low <= high).all():
             raise box.error("min", "must not exceed max")
         return lambda X: ((X >= low) & (X <= high)).all(axis=1)
