@@ -121,9 +121,8 @@ def nearest(name: str, known) -> str:
 
 def index(name, known: Sequence[str], what: str, error=SceneError) -> int:
     """Return the index of a known name. what: start of the message, such as "robot 'arm': no joint"; or raise the error."""
-    if name not in known:
-        there_are = f"; there are {', '.join(known)}" if known else ""
-        raise error(f"{what} is called {value_text(name)}{nearest(str(name), known)}{there_are}")
+    if not isinstance(name, str) or name not in known:
+        raise error(f"{what} is called {value_text(name)}{nearest(str(name), known)}; there are {', '.join(known) or 'none'}")
     return list(known).index(name)
 
 

@@ -4,7 +4,6 @@ Every input is validated and converted to arrays when it is added, so an existin
 """
 
 import copy
-import difflib
 import math
 from collections.abc import Callable, Mapping
 from functools import partial
@@ -409,10 +408,4 @@ class Scene(Guarded):
 
 def _find(items: list, name: str, kind: str) -> Body | Obstacle | Cavity:
     """Return the item with this name. Raises SceneError with the closest name if there is none."""
-    for item in items:
-        if isinstance(name, str) and item.name == name:
-            return item
-    names = [item.name for item in items]
-    near = difflib.get_close_matches(name, names, n=1) if isinstance(name, str) else []
-    hint = f"; did you mean {near[0]!r}?" if near else f"; there are {names}" if names else "; the scene has none"
-    raise SceneError(f"scene: no {kind} is called {name!r}{hint}")
+    return items[checks.index(name, [item.name for item in items], f"scene: no {kind}")]

@@ -178,8 +178,8 @@ def test_tets_fill_a_ball_that_is_inside_out():
 
 def test_bad_arguments_and_absence_and_failure_of_the_mesher_are_reported(monkeypatch):
     surface = ts.SurfaceMesh(X, T, "ball.obj")
-    rule = "greater than 0 and below .* m, the surface's diagonal"
-    for edge_length, rule in ((0.0, rule), (9.0, rule), (np.nan, "finite"), ("x", "a number"), (True, "a number")):
+    limits = "greater than 0 and below .* m, the surface's diagonal"
+    for edge_length, rule in ((0.0, limits), (9.0, limits), (np.nan, "finite"), ("x", "a number"), (True, "a number")):
         with pytest.raises(MeshError, match=f"ball.obj: edge_length must be {rule}, not"):
             ts.tetrahedralize(surface, edge_length=edge_length)
     with pytest.raises(MeshError, match="needs a SurfaceMesh"):
