@@ -32,7 +32,7 @@ from taisoft.mesh.safe_reading import Blocks, FileContent, content_of, read_by_m
 from taisoft.mesh.surface_mesh import READERS as SURFACE_READERS
 from taisoft.mesh.tet_mesh import LARGEST_COORDINATE, TetMesh
 from taisoft.mesh.tetgen import read_tetgen
-from taisoft.mesh.topology import EDGES, distinct_edges, merge_labels
+from taisoft.mesh.topology import EDGES, distinct_edges, merged_points
 from taisoft.mesh.vtu import read_vtu
 from taisoft.scene.checks import number
 
@@ -297,7 +297,6 @@ def _weld(name: str, points: np.ndarray, tets: np.ndarray, weld) -> tuple[np.nda
     shortest = float(edge_lengths(points, tets).min())
     if weld >= shortest > 0:
         raise MeshError(f"{name}: weld = {weld:g} m must be less than the shortest edge, {shortest:g} m")
-    labels = merge_labels(points, weld)
-    first = np.unique(labels, return_index=True)[1]
+    first, labels = merged_points(points, weld)
     merged = len(points) - len(first)
     return points[first], labels[tets], [f"{merged} vertices were welded to another one"] if merged else []

@@ -21,9 +21,9 @@ from taisoft.mesh.obj_off import read_obj, read_off
 from taisoft.mesh.ply import read_ply
 from taisoft.mesh.safe_reading import read_content, run_child
 from taisoft.mesh.stl import read_stl
-from taisoft.mesh.tet_mesh import TetMesh, checked_array
+from taisoft.mesh.tet_mesh import TetMesh, checked_array, checked_points
 from taisoft.mesh.texture import checked_subsets, checked_uvs, subsets_of, transferred
-from taisoft.mesh.topology import Faces, connected_pieces, crack_widths, linked_groups, merge_labels, triangle_edges
+from taisoft.mesh.topology import Faces, connected_pieces, crack_widths, linked_groups, merged_points, triangle_edges
 from taisoft.scene.checks import number
 
 READERS = {".obj": read_obj, ".stl": read_stl, ".ply": read_ply, ".off": read_off}
@@ -53,10 +53,7 @@ class SurfaceMesh:
     subsets: dict[str, np.ndarray] = field(default_factory=dict)
 
     def __post_init__(self):
-        vertices = checked_array(self.vertices, "vertices", 3, "fiu", "numbers", self._error).astype(np.float64)
-        bad = np.argwhere(~np.isfinite(vertices))
-        if len(bad):
-            raise MeshError(f"{self.source}: vertex {bad[0, 0]} coordinate {bad[0, 1]} is not finite")
+        vertices = checked_points(self.vertices, self._error)
         triangles = checked_array(self.triangles, "triangles", 3, "iu", "integers", self._error)
         bad = np.argwhere((triangles < 0) | (triangles >= len(vertices)))
         if len(bad):
@@ -196,8 +193,7 @@ def clean_surface(surface: SurfaceMesh, weld: float) -> SurfaceMesh:
     """Return the surface, welded [m], without degenerate and duplicate triangles; issue its warnings, at the caller's caller."""
     name, points, triangles = surface.source, surface.vertices, surface.triangles
     notes = list(surface.warnings)
-    labels = merge_labels(points, number(weld, f"{name}: weld", minimum=0.0, unit="m", error=MeshError))
-    first = np.unique(labels, return_index=True)[1]
+    first, labels = merged_points(points, number(weld, f"{name}: weld", minimum=0.0, unit="m", error=MeshError))
     if len(first) < len(points):
         notes.append(f"{len(points) - len(first)} of {len(points)} vertices were welded to another one")
     points, triangles = points[first], labels[triangles]

@@ -69,11 +69,8 @@ def transferred(surface, vertices: np.ndarray, triangles: np.ndarray) -> tuple[n
     rows = np.flatnonzero(normals_and_heights(surface.vertices, surface.triangles)[1] > 0.0)
     source = Triangles(surface.vertices, surface.triangles[rows])
     given = np.zeros((len(rows), 3, 2)) if surface.uvs is None else surface.uvs[rows]
-    edges, nearest, uvs = (
-        _uv_edges(source.triangles, given),
-        np.empty(len(triangles), dtype=np.int64),
-        np.empty((len(triangles), 3, 2)),
-    )
+    edges = _uv_edges(source.triangles, given)
+    nearest, uvs = np.empty(len(triangles), dtype=np.int64), np.empty((len(triangles), 3, 2))
     for first in range(0, len(triangles), CHUNK):
         at = slice(first, first + CHUNK)
         nearest[at], points, found = _located(source, edges, vertices[triangles[at]])

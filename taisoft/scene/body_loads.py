@@ -10,7 +10,7 @@ from taisoft.mesh import quadratic
 from taisoft.mesh.solids import is_closed
 from taisoft.scene import checks
 from taisoft.scene.key_frames import KeyFrames
-from taisoft.scene.loads import Activation, Cavity, NodalForce, Pressure, Traction, value_or_path
+from taisoft.scene.loads import Activation, Cavity, NodalForce, Pressure, Traction, either, value_or_path
 
 if TYPE_CHECKING:
     from taisoft.scene.body import Body
@@ -62,8 +62,7 @@ def add_cavity(self: "Body", where, pressure=None, volume=None, name: str | None
     body's. A triangle belongs to one cavity at most. Raises SceneError.
     """
     what = self._check_open("add_cavity")
-    if (pressure is None) == (volume is None):
-        raise SceneError(f"{what}: give either a pressure or a volume")
+    given, content = either(what, pressure=pressure, volume=volume)
     own = [cavity.name for cavity in self.cavities]
     name = checks.free_name(name, f"{self.name} cavity ", own, f"{what}: name")
     triangles = _triangles(self, where, what)
@@ -75,9 +74,7 @@ def add_cavity(self: "Body", where, pressure=None, volume=None, name: str | None
     rest_volume = _enclosed(self, triangles)
     if rest_volume <= 0.0:
         raise SceneError(f"{what}: the normals of the chosen triangles point outward: they must point into the cavity")
-    given = "pressure" if volume is None else "volume"
-    content = value_or_path(pressure if volume is None else volume, what, given, Cavity.shapes)
-    cavity = Cavity(name, triangles, given, rest_volume, **content)
+    cavity = Cavity(name, triangles, given, rest_volume, **value_or_path(content, what, given, Cavity.shapes))
     check_volume(cavity, f"{what}: volume")
     return self._add(self.cavities, cavity)
 

@@ -96,12 +96,14 @@ def path_value(path: Callable, t: float, what: str, quantity: str, shapes: tuple
     return None if value is None else array(value, f"{what}: the path's {quantity} at t = {t:g}", shapes)
 
 
-def length(value) -> int:
-    """Return the number of rows of a value that should be an array; 0 if it has none."""
-    try:
-        return len(value)
-    except TypeError:
-        return 0
+def times(value, what: str) -> np.ndarray:
+    """Return ascending times (k,) [s], k > 0."""
+    k = value.size if isinstance(value, np.ndarray) else len(value) if hasattr(value, "__len__") else 1
+    result = array(value, what, ((max(k, 1),),))
+    if (descends := np.diff(result) <= 0.0).any():
+        first = int(np.argmax(descends))
+        raise SceneError(f"{what} must ascend, but {result[first + 1]:g} follows {result[first]:g}")
+    return result
 
 
 def choice(value, what: str, allowed: Sequence[str], error: type[Exception] = SceneError) -> str:

@@ -14,7 +14,7 @@ from taisoft.errors import SceneError, reworded
 from taisoft.scene import checks
 from taisoft.scene.body import Body, Constraint
 from taisoft.scene.connection_records import MAX_OUTSIDE, Attachment, Point, Spring, Tendon
-from taisoft.scene.loads import value_or_path
+from taisoft.scene.loads import either, value_or_path
 from taisoft.scene.locate import locate
 from taisoft.scene.obstacles import Obstacle
 from taisoft.scene.rigid import RigidBody
@@ -68,13 +68,12 @@ def add_tendon(
     made = tuple(_point(self, end, f"{what}: point {k}") for k, end in enumerate(points))
     _check_any_body(self, made, what)
     _check_distinct(self, made, what)
-    given = _what_is_given(what, force, length)
+    given, content = either(what, force=force, length=length)
     if stiffness is not None:
         if given == "force":
             raise SceneError(f"{what}: stiffness is that of a tendon of given length: give a length instead of a force")
         stiffness = checks.number(stiffness, f"{what}: stiffness", above=0.0, unit="N/m")
-    load = value_or_path(force if given == "force" else length, what, given, ((),))
-    tendon = Tendon(name, made, **load, given=given, stiffness=stiffness)
+    tendon = Tendon(name, made, given, stiffness, **value_or_path(content, what, given, Tendon.shapes))
     check_tendon(tendon, tendon.path(0.0) if tendon.value is None else tendon.value, what)
     return self._add(self.tendons, tendon)
 
@@ -256,13 +255,6 @@ def _check_distinct(scene: "Scene", points: tuple[Point, ...], what: str) -> Non
     for k, (p, q) in enumerate(zip(points, points[1:])):
         if coincide(scene, p, q):
             raise SceneError(f"{what}: points {k} and {k + 1} coincide")
-
-
-def _what_is_given(what: str, force, length) -> str:
-    """Return which of a tendon's two is given. Raises SceneError if both are or neither is."""
-    if (force is None) == (length is None):
-        raise SceneError(f"{what}: give either a force or a length")
-    return "force" if length is None else "length"
 
 
 def _check_any_body(scene: "Scene", points: tuple[Point, ...], what: str) -> None:

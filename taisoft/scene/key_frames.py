@@ -37,17 +37,13 @@ class KeyFrames:
 
     def __post_init__(self):
         what = "key frames"
-        k = max(checks.length(self.times), 1)
-        times = checks.array(self.times, f"{what}: times", ((k,),))
-        descends = np.diff(times) <= 0
-        if descends.any():
-            first = int(np.argmax(descends))
-            raise SceneError(f"{what}: times must ascend, but {times[first + 1]:g} follows {times[first]:g}")
+        times = checks.times(self.times, f"{what}: times")
         if self.values is not None:
             self._check_values(what, times)
             return
         if self.translations is None and self.rotations is None:
             raise SceneError(f"{what}: translations, rotations or values are needed")
+        k = len(times)
         validated = {"times": times, "translations": np.zeros((k, 3))}
         for field, shape in (("translations", (k, 3)), ("rotations", (k, 3)), ("pivot", (3,))):
             if getattr(self, field) is not None:

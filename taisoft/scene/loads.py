@@ -116,6 +116,14 @@ class LoadPath:
         return self.frames(t)[0] if self.frames.values is None else self.frames.value_at(t)
 
 
+def either(what: str, **two) -> tuple:
+    """Return name and value of the one of two arguments that is given. Raises SceneError if both or neither are."""
+    given = [(name, value) for name, value in two.items() if value is not None]
+    if len(given) != 1:
+        raise SceneError(f"{what}: give either a {' or a '.join(two)}")
+    return given[0]
+
+
 def value_or_path(load, what: str, kind: str, shapes: tuple[tuple[int, ...], ...]) -> dict:
     """Return the fields value, path and path_shape of a load given as a value, a function of time, or `KeyFrames`.
 

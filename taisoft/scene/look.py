@@ -93,11 +93,7 @@ class Camera:
     follow: str | None = None  #: name of a body with whose mean displacement the camera moves along
 
     def __post_init__(self):
-        times = None
-        if self.times is not None:
-            times = checks.array(self.times, "camera: times", ((max(checks.length(self.times), 1),),))
-            if (np.diff(times) <= 0.0).any():
-                raise SceneError("camera: times must ascend")
+        times = None if self.times is None else checks.times(self.times, "camera: times")
         k = () if times is None else (len(times),)
         values = {"position": ((3,), (*k, 3)), "target": ((3,), (*k, 3)), "fov": ((), k)}
         values = {name: checks.array(getattr(self, name), f"camera: {name}", shapes) for name, shapes in values.items()}

@@ -163,9 +163,9 @@ class MeshObstacle(Shape):
     word: ClassVar[str] = "mesh obstacle"
 
     def __post_init__(self):
-        vertices = checks.array(self.vertices, "mesh obstacle: vertices", ((max(checks.length(self.vertices), 3), 3),))
         with reworded(MeshError, "mesh obstacle: ", raised=SceneError, without="mesh obstacle: "):
-            triangles = SurfaceMesh(vertices, self.triangles, "mesh obstacle").triangles
+            surface = SurfaceMesh(self.vertices, self.triangles, "mesh obstacle")
+            vertices, triangles = surface.vertices, surface.triangles
             flat = np.flatnonzero(~(normals_and_heights(vertices, triangles)[1] > DEGENERATE))
             if len(flat):
                 raise SceneError(
