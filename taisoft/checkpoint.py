@@ -23,6 +23,7 @@ from taisoft.attributes import thawed
 from taisoft.errors import SceneError, SimulationError
 from taisoft.files import replacing
 from taisoft.nested import join_arrays, part_arrays
+from taisoft.scene.checks import instance
 from taisoft.scene.fingerprint import FEATURES, digest, scene_fingerprint
 from taisoft.scene.numbers import Numbers, first_difference, scene_numbers, set_numbers
 from taisoft.scene.scene import Scene
@@ -225,8 +226,7 @@ def load_checkpoint(cls: type["Simulator"], path: str | Path, scene: Scene, arch
 
 def from_checkpoint(cls: type["Simulator"], saved: Checkpoint, scene: Scene, arch: str | None = None) -> "Simulator":
     """Do as `load_checkpoint`, from a file's content."""
-    if not isinstance(scene, Scene):
-        raise SceneError(f"scene must be a Scene, not {type(scene).__name__}")
+    instance(scene, "scene", Scene)
     settings = saved.settings | ({} if arch is None else {"arch": arch})
     if set(settings) != set(NAMES):
         raise SimulationError(f"{saved.path} holds no state of this scene: its settings are not those of this version")

@@ -55,8 +55,7 @@ FIXED = ("dt", "precision", "arch")  # settings that `Simulator.rebuild` is not 
 
 def check_settings(scene: Scene, **given) -> Settings:
     """Check every argument of a Simulator. Raises SceneError or SimulationError."""
-    if not isinstance(scene, Scene):
-        raise SceneError(f"scene must be a Scene, not {type(scene).__name__}")
+    checks.instance(scene, "scene", Scene)
     if not scene.bodies:
         raise SceneError("the scene holds no body")
     scene.check()

@@ -116,9 +116,8 @@ class Body(Guarded):
     ):
         """The arguments of `Scene.add_body`; numbers: young, poisson and density, if they replace the material's."""
         what = f"body {name!r}"
-        if not isinstance(mesh, TetMesh):
-            raise SceneError(f"{what}: mesh must be a TetMesh, not {type(mesh).__name__}")
-        self.name, self.mesh, self.composition = name, mesh, compose(what, mesh, material, fibres, **numbers)
+        self.name, self.mesh = name, checks.instance(mesh, f"{what}: mesh", TetMesh)
+        self.composition = compose(what, mesh, material, fibres, **numbers)
         self.order = checks.whole(order, f"{what}: order", tuple(QUADRATURE_DEGREES))
         degrees = QUADRATURE_DEGREES[self.order]
         degree = degrees[0] if quadrature_degree is None else quadrature_degree

@@ -344,10 +344,8 @@ class Scene(Guarded):
 
     def cavity(self, name: str) -> tuple[Body, Cavity]:
         """Return the cavity with this name, and its body. Raises SceneError if there is none."""
-        owners = [body for body in self.bodies for _ in body.cavities]
-        cavities = [cavity for body in self.bodies for cavity in body.cavities]
-        found = _find(cavities, name, "cavity")
-        return owners[cavities.index(found)], found
+        owned = [(body, cavity) for body in self.bodies for cavity in body.cavities]
+        return owned[checks.index(name, [cavity.name for _, cavity in owned], "scene: no cavity")]
 
     def obstacle(self, name: str) -> Obstacle:
         """Return the obstacle with this name. Raises SceneError if there is none."""
@@ -406,6 +404,6 @@ class Scene(Guarded):
         return checks.free_name(name, kind, [one.name for one in self.colliders])
 
 
-def _find(items: list, name: str, kind: str) -> Body | Obstacle | Cavity:
+def _find(items: list, name: str, kind: str) -> Body | Obstacle:
     """Return the item with this name. Raises SceneError with the closest name if there is none."""
     return items[checks.index(name, [item.name for item in items], f"scene: no {kind}")]

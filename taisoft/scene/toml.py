@@ -52,7 +52,7 @@ from taisoft.scene.material import Material
 from taisoft.scene.obstacles import Box, Capsule, HalfSpace, MeshObstacle, Sphere
 from taisoft.scene.scene import Scene
 from taisoft.scene.tables import Table, arguments_of, check_values, value_text
-from taisoft.scene.toml_connections import add_connections
+from taisoft.scene.toml_connections import CONNECTIONS, add_connections
 from taisoft.scene.toml_look import LOOK_KEYS, read_look
 from taisoft.scene.toml_meshes import kind_of, mesh_of, solid_of, surface_of
 from taisoft.scene.toml_methods import METHODS, OF_RIGID, call_methods
@@ -63,17 +63,8 @@ SCENE_KEYS = ("up", "gravity", "allow_initial_overlap", "contact_forces")  # att
 TOP_KEYS = [
     *SCENE_KEYS,
     *LOOK_KEYS,
-    "body_order",
-    "collision",
-    "solver",
-    "materials",
-    "bodies",
-    "rigid_bodies",
-    "obstacles",
-    "contacts",
-    "springs",
-    "tendons",
-    "attachments",
+    *("body_order", "collision", "solver", "materials", "bodies", "rigid_bodies", "obstacles", "contacts"),
+    *CONNECTIONS,
 ]
 SURFACE_KEYS = ("friction", "restitution")
 OBSTACLE_KEYS = [*SURFACE_KEYS, "colour", "opacity"]

@@ -8,11 +8,13 @@ from taisoft.scene.tables import Table, arguments_of, key_path
 from taisoft.scene.toml_methods import selection
 from taisoft.scene.toml_values import load_value, nodes_of
 
+CONNECTIONS = {"springs": "add_spring", "tendons": "add_tendon", "attachments": "attach"}  # key at top level -> method
+
 
 def add_connections(scene: Scene, tables: Table) -> None:
     """Add the connections in the tables of a file. Raises SceneError."""
-    for kind, method in (("springs", scene.add_spring), ("tendons", scene.add_tendon), ("attachments", scene.attach)):
-        parent, item = tables.named(kind), kind[:-1]
+    for kind, call in CONNECTIONS.items():
+        parent, item, method = tables.named(kind), kind[:-1], getattr(scene, call)
         known, required = arguments_of(method, "name")
         known, required = (["nodes" if key == "where" else key for key in keys] for keys in (known, required))
         for name in parent.known:
