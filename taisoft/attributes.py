@@ -5,13 +5,15 @@ nearest known one, refuses a read-only attribute and names the call to use inste
 frozen. `guarded_record` gives a frozen dataclass the same messages. Reading (getattr, hasattr, dir) is not changed.
 """
 
+import dataclasses
 import difflib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import ClassVar
+from typing import ClassVar, dataclass_transform
 
 import numpy as np
 
+from taisoft.display import short_repr
 from taisoft.errors import MeshError, SceneError, SimulationError
 
 _NOTHING = object()
@@ -71,10 +73,16 @@ class Guarded:
                 value.setflags(write=False)
         self.__dict__["_frozen"] = True
 
-    def _check_open(self, call: str) -> None:
-        """Raise the error of a call that would change a frozen object."""
+    def _check_open(self, call: str) -> str:
+        """Return the start of messages of a call that changes the object. Raises the error of the call if it is frozen."""
         if self._frozen:
             raise self._frozen_error(call)
+        return f"{self._label()}: {call}"
+
+    def _add(self, items: list, one):
+        """Append one to a guarded list of the object, and return it."""
+        list.append(items, one)
+        return one
 
     def _frozen_error(self, name: str) -> Exception:
         call = callable(_declared(type(self), name))
@@ -146,14 +154,29 @@ def thawed(*items: Guarded) -> Iterator[None]:
                 one._freeze()
 
 
-def guarded_record(what: str, instead: str, error: type[Exception] = SceneAttributeError) -> Callable[[type], type]:
-    """Return a decorator that gives a frozen dataclass the messages of `Guarded`.
+@dataclass_transform(eq_default=False, frozen_default=True, field_specifiers=(dataclasses.field,))
+def guarded_record(
+    what: str, instead: str, error: type[Exception] = SceneAttributeError, eq: bool = False
+) -> Callable[[type], type]:
+    """Return a decorator that makes a class a frozen dataclass with the messages of `Guarded` and read-only arrays.
 
     what: its label in messages, followed by its name if it has one; instead: what to do instead of changing an attribute, with
-    {name} for the attribute. Arrays of copies and pickles are read-only, as those of the original are.
+    {name} for the attribute; eq: whether records are compared by value. Those that are not have the repr `short_repr`.
     """
 
     def guard(cls: type) -> type:
+        check = getattr(cls, "__post_init__", None)
+
+        def make_read_only(self) -> None:
+            for value in vars(self).values():
+                if isinstance(value, np.ndarray):
+                    value.setflags(write=False)
+
+        def check_and_protect(self) -> None:
+            if check is not None:
+                check(self)
+            make_read_only(self)
+
         def refuse(self, name: str, value=None) -> None:
             own_name = getattr(self, "name", None)
             label = what if own_name is None else f"{what} {own_name!r}"
@@ -166,10 +189,12 @@ def guarded_record(what: str, instead: str, error: type[Exception] = SceneAttrib
 
         def set_state(self, state: dict) -> None:
             self.__dict__.update(state)
-            for value in state.values():
-                if isinstance(value, np.ndarray):
-                    value.setflags(write=False)
+            make_read_only(self)
 
+        cls.__post_init__ = check_and_protect
+        if not eq and "__repr__" not in vars(cls):
+            cls.__repr__ = short_repr
+        cls = dataclasses.dataclass(frozen=True, eq=eq)(cls)
         cls.__setattr__, cls.__delattr__, cls.__setstate__ = refuse, refuse, set_state
         return cls
 

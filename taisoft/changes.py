@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 from taisoft.attributes import thawed
 from taisoft.errors import SceneError, SimulationError
 from taisoft.queries import body_index, check_rows, nodes_of
+from taisoft.scene.body_loads import activate_fibres
 from taisoft.scene.connections import check_exact
 from taisoft.scene.plan import CHANGEABLE, change_load, change_material, change_tendon
 from taisoft.settings import FIXED, NAMES, check_dt
@@ -206,7 +207,7 @@ def set_activation(self: "Simulator", body: str, value: float, region: int | str
     what = f"body {changed.name!r}: set_activation"
     if callable(value):
         raise SceneError(f"{what}: it must be a number: give body.activate a path before the Simulator is made")
-    changed._activate(value, region, what)
+    activate_fibres(changed, value, region, what)
     dynamics.loads_changed()
 
 

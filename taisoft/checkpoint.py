@@ -23,6 +23,7 @@ from taisoft.attributes import thawed
 from taisoft.errors import SceneError, SimulationError
 from taisoft.files import replacing
 from taisoft.nested import join_arrays, part_arrays
+from taisoft.scene.checks import instance
 from taisoft.scene.fingerprint import FEATURES, digest, scene_fingerprint
 from taisoft.scene.numbers import Numbers, first_difference, scene_numbers, set_numbers
 from taisoft.scene.scene import Scene
@@ -93,7 +94,7 @@ def read_checkpoint(path: str | Path) -> Checkpoint:
     try:
         return Checkpoint(Path(path), **{name: join_arrays(header[name], arrays) for name in PARTS})
     except (KeyError, TypeError) as error:
-        raise _no_checkpoint(Path(path), error) from None
+        raise SimulationError(f"{path} is no checkpoint of taisoft, or damaged: {_sentence(error)}") from None
 
 
 def check_scene(saved: Checkpoint, scene: Scene, features: dict[str, bool]) -> None:
@@ -157,54 +158,38 @@ def _check_sizes(path: Path) -> None:
 
 def _contents(path: Path) -> tuple[dict, dict[str, np.ndarray]]:
     """Return a file's header and arrays, after checking them. Raises SimulationError."""
+    fault = "is no checkpoint of taisoft, or damaged"
     try:
         file = np.load(path, allow_pickle=False)
-    except FileNotFoundError:
-        raise SimulationError(f"{path}: no such checkpoint") from None
-    except OSError as error:  # with a file's name where the system refuses it
-        raise _no_checkpoint(path, error.strerror if error.filename else error) from None
-    except Exception as error:  # NumPy and zipfile raise many types for foreign or truncated files
-        raise _no_checkpoint(path, error) from None
-    if not isinstance(file, np.lib.npyio.NpzFile):
-        raise _no_checkpoint(path, "it holds one array")
-    with file:
-        try:
+        if not isinstance(file, np.lib.npyio.NpzFile):
+            raise _UnfitContent("it holds one array")
+        with file:
             _check_sizes(path)
             text = file["header"]
             header = json.loads(text.tobytes())
-            kind, version = header["kind"], int(header["format"])
-            writer = str(header["taisoft"])
-            fits = all(isinstance(header.get(key), dict) for key in PARTS)
-        except Exception as error:
-            raise _no_checkpoint(path, error) from None
-        if kind != KIND:
-            raise _no_checkpoint(path, f"its kind is {kind!r}")
-        if version != FORMAT:
-            raise SimulationError(
-                f"{path} was written by taisoft {writer} in format {version}, and taisoft {__version__} reads format {FORMAT}"
-            )
-        if not fits:
-            raise _no_checkpoint(path, "its header has another structure")
-        try:
+            if header["kind"] != KIND:
+                raise _UnfitContent(f"its kind is {header['kind']!r}")
+            if header["format"] != FORMAT:
+                made = f"was written by taisoft {header['taisoft']} in format {header['format']}"
+                raise SimulationError(f"{path} {made}, and taisoft {__version__} reads format {FORMAT}")
+            if not all(isinstance(header.get(key), dict) for key in PARTS):
+                raise _UnfitContent("its header has another structure")
+            fault = "is damaged"
             arrays = {name: file[name] for name in file.files if name not in ("header", "sha256")}
-            intact = np.array_equal(file["sha256"], _checksum(text, arrays))
-        except Exception as error:
-            raise _damaged(path, error) from None
-    if not intact:
-        raise _damaged(path, "its checksum does not match its content")
+            if not np.array_equal(file["sha256"], _checksum(text, arrays)):
+                raise _UnfitContent("its checksum does not match its content")
+    except SimulationError:
+        raise
+    except FileNotFoundError:
+        raise SimulationError(f"{path}: no such checkpoint") from None
+    except Exception as error:  # NumPy and zipfile raise many types for foreign or truncated files
+        is_refusal = isinstance(error, OSError) and error.filename  # of the system
+        raise SimulationError(f"{path} {fault}: {error.strerror if is_refusal else _sentence(error)}") from None
     return header, arrays
 
 
-def _no_checkpoint(path: Path, reason: Exception | str) -> SimulationError:
-    return SimulationError(f"{path} is no checkpoint of taisoft, or damaged: {_sentence(reason)}")
-
-
-def _damaged(path: Path, reason: Exception | str) -> SimulationError:
-    return SimulationError(f"{path} is damaged: {_sentence(reason)}")
-
-
-def _sentence(reason: Exception | str) -> str:
-    return str(reason) if isinstance(reason, str | _UnfitContent) else "expected arrays in a zip archive, as taisoft writes them"
+def _sentence(error: Exception) -> str:
+    return str(error) if isinstance(error, _UnfitContent) else "expected arrays in a zip archive, as taisoft writes them"
 
 
 # --- methods of Simulator -----------------------------------------------------------------------------------------------
@@ -241,8 +226,7 @@ def load_checkpoint(cls: type["Simulator"], path: str | Path, scene: Scene, arch
 
 def from_checkpoint(cls: type["Simulator"], saved: Checkpoint, scene: Scene, arch: str | None = None) -> "Simulator":
     """Do as `load_checkpoint`, from a file's content."""
-    if not isinstance(scene, Scene):
-        raise SceneError(f"scene must be a Scene, not {type(scene).__name__}")
+    instance(scene, "scene", Scene)
     settings = saved.settings | ({} if arch is None else {"arch": arch})
     if set(settings) != set(NAMES):
         raise SimulationError(f"{saved.path} holds no state of this scene: its settings are not those of this version")

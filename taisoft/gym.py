@@ -190,11 +190,7 @@ class Env(gymnasium.Env):
             if not space.contains(action):
                 raise SceneError(f"the action {value_text(action)} is not in {space}")
             return action
-        shape, dtype, low, high = self._acts_by
-        if (found := _cast(action, dtype)) is None:
-            raise SceneError(f"an action must be numbers of type {dtype} and shape {shape}, not {value_text(action)}")
-        if found.shape != shape:
-            raise SceneError(f"an action must have shape {shape}, not {found.shape}")
+        found, (_, _, low, high) = _cast(action, self._acts_by, "an action"), self._acts_by
         if 0 in ((found >= low) & (found <= high)).tobytes():  # where code is cold, `all` takes three times as long
             raise SceneError(_outside(found, space))
         return found
@@ -204,24 +200,25 @@ class Env(gymnasium.Env):
         found = self._observe(self.sim)
         if self._sensed_by is None:
             return found
-        shape, dtype, _, _ = self._sensed_by
-        if (numbers := _cast(found, dtype)) is None:
-            raise SceneError(f"observation: it returned {value_text(found)}, numbers of type {dtype} are needed")
-        if numbers.shape != shape:
-            raise SceneError(f"observation: it returned shape {numbers.shape}, the observation space has {shape}")
+        numbers = _cast(found, self._sensed_by, "an observation")
         if not (math.isfinite(np.vdot(numbers, numbers)) or np.isfinite(numbers).all()):  # the former is fast
             at = _label(self.observation_space, np.argwhere(~np.isfinite(numbers))[0])
             raise SceneError(f"observation: {at} is not finite at t = {self.sim.time:.6g} s")
         return numbers
 
 
-def _cast(values, dtype: np.dtype) -> np.ndarray | None:
-    """Return values as an array of a space's type; None where they cannot be, or integers would change."""
+def _cast(values, box: tuple, what: str) -> np.ndarray:
+    """Return values as an array of the type and shape of a `_box`. Raises SceneError, also where integers would change."""
+    shape, dtype, _, _ = box
     try:
         found = np.array(values, dtype)
     except (TypeError, ValueError, OverflowError):
-        return None
-    return None if dtype.kind in "iu" and not np.array_equal(found, values) else found
+        found = None
+    if found is None or (dtype.kind in "iu" and not np.array_equal(found, values)):
+        raise SceneError(f"{what} must be numbers of type {dtype} and shape {shape}, not {value_text(values)}")
+    if found.shape != shape:
+        raise SceneError(f"{what} must have shape {shape}, not {found.shape}")
+    return found
 
 
 def _box(space: "gymnasium.Space") -> tuple | None:

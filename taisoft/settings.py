@@ -19,8 +19,7 @@ WITH_MULTIPLIERS = ("implicit_euler", "bdf2")
 CONTACT_SOLVERS = ("auto", *EXPLICIT_CONTACT, *IMPLICIT_CONTACT)
 
 
-@guarded_record("settings", "call sim.rebuild({name}=...)")
-@dataclasses.dataclass(frozen=True)
+@guarded_record("settings", "call sim.rebuild({name}=...)", eq=True)
 class Settings:
     """Arguments of a Simulator besides the scene; tolerances are relative, None is the default or adaptive."""
 
@@ -56,8 +55,7 @@ FIXED = ("dt", "precision", "arch")  # settings that `Simulator.rebuild` is not 
 
 def check_settings(scene: Scene, **given) -> Settings:
     """Check every argument of a Simulator. Raises SceneError or SimulationError."""
-    if not isinstance(scene, Scene):
-        raise SceneError(f"scene must be a Scene, not {type(scene).__name__}")
+    checks.instance(scene, "scene", Scene)
     if not scene.bodies:
         raise SceneError("the scene holds no body")
     scene.check()

@@ -32,8 +32,9 @@ from taisoft.mesh.safe_reading import Blocks, FileContent, content_of, read_by_m
 from taisoft.mesh.surface_mesh import READERS as SURFACE_READERS
 from taisoft.mesh.tet_mesh import LARGEST_COORDINATE, TetMesh
 from taisoft.mesh.tetgen import read_tetgen
-from taisoft.mesh.topology import EDGES, distinct_edges, merge_labels
+from taisoft.mesh.topology import EDGES, distinct_edges, merged_points
 from taisoft.mesh.vtu import read_vtu
+from taisoft.scene.checks import number
 
 TETS = ("tetra", "tetra10")
 BOUNDARY = ("vertex", "line", "line3", "triangle", "triangle6")  # boundary markers that meshers add; ignored with a warning
@@ -292,12 +293,10 @@ def _middles_by_edge(name: str, points: np.ndarray, tets: np.ndarray, rows: np.n
 
 def _weld(name: str, points: np.ndarray, tets: np.ndarray, weld) -> tuple[np.ndarray, np.ndarray, list[str]]:
     """Merge vertices at most `weld` [m] apart into the first of each group; return points, tets and warnings."""
-    if isinstance(weld, bool) or not isinstance(weld, (int, float, np.number)) or not 0 <= weld < np.inf:
-        raise MeshError(f"{name}: weld must be a distance of at least 0 m, or None, not {value_text(weld)}")
+    weld = number(weld, f"{name}: weld", minimum=0.0, unit="m", error=MeshError)
     shortest = float(edge_lengths(points, tets).min())
     if weld >= shortest > 0:
-        raise MeshError(f"{name}: weld = {float(weld):g} m must be less than the shortest edge, {shortest:g} m")
-    labels = merge_labels(points, float(weld))
-    first = np.unique(labels, return_index=True)[1]
+        raise MeshError(f"{name}: weld = {weld:g} m must be less than the shortest edge, {shortest:g} m")
+    first, labels = merged_points(points, weld)
     merged = len(points) - len(first)
     return points[first], labels[tets], [f"{merged} vertices were welded to another one"] if merged else []

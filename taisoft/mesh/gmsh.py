@@ -123,15 +123,14 @@ def read_gmsh(name: str, data: bytes) -> FileContent | None:
         parts = partial(_entities_4, parted=True)
         readers = {"Nodes": _nodes_4, "Elements": _elements_4, "Entities": _entities_4, "PartitionedEntities": parts}
         readers = {section: partial(reader, old=version != "4.1") for section, reader in readers.items()}
-    sections, fibres = {}, None
+    sections, fibres, opened = {}, None, partial(_Binary, order=order, size=size) if binary else _Text
     while opening := _OPENING.search(data, at):
         section, at = opening[1].decode("ascii", "replace"), opening.end()
         if section == "ElementData" and (start := _FIBRES.match(data, at)):
             if (found := _TAGS.match(data, start.end())) is None:
                 line = data.count(b"\n", 0, start.end()) + 1
                 raise MeshError(f"{name}: line {line} (${section}): expected numbers of tags, three components and a count")
-            at = found.end()
-            numbers = _Binary(name, data, at, section, order, size) if binary else _Text(name, data, at, section)
+            numbers = opened(name, data, found.end(), section)
             fibres, at = numbers.rows(int(found[1] or found[2]), 3), numbers.close()
             continue
         if section not in readers:
@@ -142,7 +141,7 @@ def read_gmsh(name: str, data: bytes) -> FileContent | None:
         if section in sections:
             line = data.count(b"\n", 0, at)
             raise MeshError(f"{name}: line {line}: expected only one ${section} section")
-        numbers = _Binary(name, data, at, section, order, size) if binary else _Text(name, data, at, section)
+        numbers = opened(name, data, at, section)
         sections[section] = readers[section](numbers)
         at = numbers.close()
     for section in ("Nodes", "Elements"):

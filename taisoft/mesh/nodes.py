@@ -7,13 +7,12 @@ not on the order of a tet's corners. Where edges are straight at rest the eight 
 curved element, they interpolate the nodes linearly.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import scipy.sparse as sp
 
 from taisoft.attributes import MeshAttributeError, guarded_record
-from taisoft.display import short_repr
 from taisoft.errors import MeshError
 from taisoft.mesh.tet_mesh import TetMesh
 from taisoft.mesh.topology import EDGES, distinct_edges
@@ -38,7 +37,6 @@ for _k, (_a, _b) in enumerate(EDGES):
 
 
 @guarded_record("nodes", "they follow from the mesh and the order; add another body", MeshAttributeError)
-@dataclass(frozen=True, eq=False)
 class Nodes:
     """Nodes of a body and their connectivity; arrays are read-only.
 
@@ -58,12 +56,6 @@ class Nodes:
     surface: np.ndarray
     curved: np.ndarray | None = None
     embedded: sp.csr_matrix | None = None
-
-    __repr__ = short_repr
-
-    def __post_init__(self):
-        for array in (self.positions, self.elements, self.boundary, self.boundary_tets, self.tets, self.surface):
-            array.setflags(write=False)
 
     @property
     def n_elastic(self) -> int:

@@ -8,10 +8,10 @@ import warnings
 
 import numpy as np
 
-from taisoft.errors import MeshError, value_text
-from taisoft.mesh.shapes import checked_vector
+from taisoft.errors import MeshError
 from taisoft.mesh.surface_mesh import SurfaceMesh, as_surface
 from taisoft.mesh.tet_mesh import TetMesh
+from taisoft.scene.checks import choice, number, vector
 
 TO_Y_UP = {  # up axis -> rotation (3,3) that turns it to y by 90 degrees about another axis
     "x": np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]),
@@ -36,7 +36,7 @@ def place(mesh: TetMesh | SurfaceMesh, up: str = "y", scale: float = 1.0, rotate
     turn = placement(up, scale, rotate, to)
     vertices, shift = mesh.vertices @ turn.T, 0.0
     if at is not None:
-        shift = checked_vector(at, "place", "at") - underside(vertices, to)
+        shift = vector(at, "place: at", error=MeshError) - underside(vertices, to)
         vertices = vertices + shift
     if isinstance(mesh, SurfaceMesh):
         return SurfaceMesh(vertices, mesh.triangles, mesh.source, list(mesh.warnings), mesh.uvs, mesh.subsets)
@@ -57,12 +57,11 @@ def placement(up: str, scale: float, rotate, to: str) -> np.ndarray:
     """Return the matrix (3,3) of `place`. Raises MeshError."""
     from scipy.spatial.transform import Rotation
 
-    for what, axis, known in (("up", up, TO_Y_UP), ("to", to, FROM_Y_UP)):
-        if axis not in known:
-            raise MeshError(f"place: {what} must be one of {', '.join(known)}, not {value_text(axis)}")
-    if isinstance(scale, bool) or not isinstance(scale, (int, float, np.number)) or not 0.0 < scale < np.inf:
-        raise MeshError(f"place: scale must be a number above 0, not {value_text(scale)}")
-    turn = Rotation.from_euler("xyz", checked_vector(rotate, "place", "rotate"), degrees=True).as_matrix()  # about fixed axes
+    choice(up, "place: up", TO_Y_UP, MeshError)
+    choice(to, "place: to", FROM_Y_UP, MeshError)
+    scale = number(scale, "place: scale", above=0.0, error=MeshError)
+    angles = vector(rotate, "place: rotate", error=MeshError)
+    turn = Rotation.from_euler("xyz", angles, degrees=True).as_matrix()  # about fixed axes
     whole = np.round(turn)
     turn = np.where(np.abs(turn - whole) < 1e-15, whole, turn)  # quarter turns are exact
     return scale * (turn @ FROM_Y_UP[to] @ TO_Y_UP[up])

@@ -11,14 +11,19 @@ from taisoft.errors import MeshError, listed, one_line, value_text
 LARGEST_ID = 2**31 - 1  # of a region: mesh files hold 32-bit integers
 
 
+def as_array(values, what: str, kinds: str, error: Callable[[str], MeshError]) -> np.ndarray:
+    """Return values as an array. kinds: what it should hold; error: makes an error of its text."""
+    try:
+        return np.asarray(values)
+    except (ValueError, TypeError, OverflowError) as reason:
+        raise error(f"{what} must be an array of {kinds}: {one_line(str(reason))}") from reason
+
+
 def checked_regions(values, n_tets: int, error: Callable[[str], MeshError]) -> np.ndarray | None:
     """Return a copy (m,) int64 of the regions of all tets; None for None. error: makes an error of its text."""
     if values is None:
         return None
-    try:
-        array = np.asarray(values)
-    except (ValueError, TypeError, OverflowError) as reason:
-        raise error(f"regions must be an array of integers ({reason})") from reason
+    array = as_array(values, "regions", "integers", error)
     if array.dtype.kind not in "iu":
         raise error(f"regions must be integers, not of type {array.dtype}")
     if array.shape != (n_tets,):

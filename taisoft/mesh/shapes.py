@@ -9,6 +9,7 @@ that the shapes of small tets stay, and maps the sphere to itself.
 """
 
 import itertools
+from functools import partial
 from numbers import Integral
 
 import numpy as np
@@ -16,8 +17,10 @@ import numpy as np
 from taisoft.attributes import thawed
 from taisoft.errors import MeshError, value_text
 from taisoft.mesh.tet_mesh import TetMesh
+from taisoft.scene.checks import choice, number, vector
 
 MAX_TETS = 50_000_000  # about 20 GB of memory while a mesh is built and checked
+_vector, _positive = partial(vector, error=MeshError), partial(number, above=0.0, error=MeshError)
 
 # Corners of a cell are numbered 4 dx + 2 dy + dz.
 _FIVE_EVEN = np.array([(0, 6, 3, 5), (4, 6, 0, 5), (2, 0, 6, 3), (1, 0, 3, 5), (7, 6, 5, 3)])
@@ -34,11 +37,10 @@ def box_mesh(cells, size, center=(0.0, 0.0, 0.0), pattern: str = "five", grading
     Raises MeshError for arguments outside these rules.
     """
     cells = _checked_cells(cells, "box_mesh", (3,))
-    size, center = checked_vector(size, "box_mesh", "size", positive=True), checked_vector(center, "box_mesh", "center")
-    if pattern not in ("five", "six"):
-        raise MeshError(f"box_mesh: pattern must be 'five' or 'six', not {value_text(pattern)}")
+    size, center = _vector(size, "box_mesh: size", above=0.0), _vector(center, "box_mesh: center")
+    choice(pattern, "box_mesh: pattern", ("five", "six"), MeshError)
     _check_count(cells, 5 if pattern == "five" else 6, "box_mesh")
-    grading = checked_vector(grading, "box_mesh", "grading", positive=True)
+    grading = _vector(grading, "box_mesh: grading", above=0.0)
     vertices = center + size * _grid_points(cells, grading)
     corners = _cell_corners(cells)
     recipe = {"shape": "box", "cells": cells, "size": size, "center": center, "pattern": pattern}
@@ -57,13 +59,11 @@ def sheet_mesh(cells, size, center=(0.0, 0.0, 0.0), pattern: str = "five", up: s
     cells: (nx, ny, nz), or without the number of layers, which is then one. size: (3,) along x, y, z [m]; the thickness must not
     exceed the lengths. center, pattern, vertex order and errors as for `box_mesh`.
     """
-    if up not in ("y", "z"):
-        raise MeshError(f"sheet_mesh: up must be one of y, z, not {value_text(up)}")
-    across = "xyz".index(up)
+    across = "xyz".index(choice(up, "sheet_mesh: up", ("y", "z"), MeshError))
     cells = _checked_cells(cells, "sheet_mesh", (2, 3))
     if len(cells) == 2:
         cells = np.insert(cells, across, 1)
-    size = checked_vector(size, "sheet_mesh", "size", positive=True)
+    size = _vector(size, "sheet_mesh: size", above=0.0)
     if size[across] > min(size):
         raise MeshError(f"sheet_mesh: size {size.tolist()} has a thickness size[{across}] above one of the lengths")
     return box_mesh(cells, size, center, pattern)
@@ -80,8 +80,8 @@ def ball_mesh(radius: float, cells: int, center=(0.0, 0.0, 0.0), grading: float 
     the sphere, which would make it nearly flat.
     """
     _check_across(cells, "ball_mesh")
-    radius = _positive(radius, "ball_mesh", "radius")
-    center, grid = checked_vector(center, "ball_mesh", "center"), np.array([cells] * 3)
+    radius = _positive(radius, "ball_mesh: radius")
+    center, grid = _vector(center, "ball_mesh: center"), np.array([cells] * 3)
     _check_count(grid, 6, "ball_mesh")
     grading, towards = _checked_grading(grading, towards, "ball_mesh")
     recipe = {"shape": "ball", "radius": radius, "cells": int(cells), "center": center}
@@ -99,12 +99,11 @@ def cylinder_mesh(
     "z". center: (3,) [m]. grading: how many times as long cells are opposite the face or the line of the surface in the direction
     `towards` (3,), along the axis or perpendicular to it, as there. Raises MeshError for arguments outside these rules.
     """
-    if axis not in ("x", "y", "z"):
-        raise MeshError(f"cylinder_mesh: axis must be one of x, y, z, not {value_text(axis)}")
+    choice(axis, "cylinder_mesh: axis", ("x", "y", "z"), MeshError)
     across, along = _checked_cells(cells, "cylinder_mesh", (2,)).tolist()
     _check_across(across, "cylinder_mesh")
-    radius, height = _positive(radius, "cylinder_mesh", "radius"), _positive(height, "cylinder_mesh", "height")
-    center, grid = checked_vector(center, "cylinder_mesh", "center"), np.array([across, across, along])
+    radius, height = _positive(radius, "cylinder_mesh: radius"), _positive(height, "cylinder_mesh: height")
+    center, grid = _vector(center, "cylinder_mesh: center"), np.array([across, across, along])
     _check_count(grid, 6, "cylinder_mesh")
     grading, towards = _checked_grading(grading, towards, "cylinder_mesh")
     order = (np.arange(1, 4) + "xyz".index(axis)) % 3  # the axis last
@@ -126,13 +125,9 @@ def _check_across(cells, shape: str) -> None:
         raise MeshError(f"{shape}: cells must be an even integer, at least 2, not {value_text(cells)}")
 
 
-def _positive(value, owner: str, what: str) -> float:
-    return float(checked_vector([value] * 3, owner, what, positive=True)[0])
-
-
 def _checked_grading(grading, towards, shape: str) -> tuple[float, np.ndarray]:
     """Return the grading and the unit vector (3,)."""
-    grading, towards = _positive(grading, shape, "grading"), checked_vector(towards, shape, "towards")
+    grading, towards = _positive(grading, f"{shape}: grading"), _vector(towards, f"{shape}: towards")
     length = np.linalg.norm(towards)
     if length == 0.0:
         raise MeshError(f"{shape}: towards must be a direction, not (0, 0, 0)")
@@ -228,16 +223,3 @@ def _check_count(cells: np.ndarray, tets_per_cell: int, shape: str) -> None:
             f"{shape}: cells {tuple(cells.tolist())} give {n} tets, about {400 * n / 1e9:.3g} GB of memory; "
             f"at most {MAX_TETS} tets are allowed"
         )
-
-
-def checked_vector(values, owner: str, what: str, positive: bool = False) -> np.ndarray:
-    """Return three finite numbers, positive ones if requested, as float64 (3,). Raises MeshError; owner: starts its text."""
-    try:
-        array = np.asarray(values)
-    except ValueError as error:
-        raise MeshError(f"{owner}: {what} must be three numbers, not {value_text(values)}") from error
-    if array.shape != (3,) or array.dtype.kind not in "fiu" or not np.isfinite(array).all():
-        raise MeshError(f"{owner}: {what} must be three finite numbers, not {value_text(values)}")
-    if positive and not (array > 0).all():
-        raise MeshError(f"{owner}: {what} must be positive, not {value_text(values)}")
-    return array.astype(np.float64)

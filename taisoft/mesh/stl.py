@@ -10,7 +10,7 @@ import re
 import numpy as np
 
 from taisoft.errors import MeshError
-from taisoft.mesh.topology import merge_labels
+from taisoft.mesh.topology import merged_points
 from taisoft.mesh.words import Words, last_line
 
 HEADER, FACET = 84, 50  # bytes of the header with the number of facets, and of a facet
@@ -54,5 +54,5 @@ def _read_text(name: str, data: bytes) -> tuple[np.ndarray, list[np.ndarray]]:
 
 def _shared(corners: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
     """Return the different corners in the order of the file, and triangles of them."""
-    labels = merge_labels(corners, 0.0)
-    return corners[np.unique(labels, return_index=True)[1]], [labels.reshape(-1, 3)]
+    first, vertex = merged_points(corners, 0.0)
+    return corners[first], [vertex.reshape(-1, 3)]

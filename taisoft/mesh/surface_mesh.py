@@ -7,9 +7,8 @@ Source: Hu, Schneider, Wang, Zorin, Panozzo 2020, Fast tetrahedral meshing in th
 
 import tempfile
 import warnings
-from dataclasses import dataclass, field
+from dataclasses import field
 from importlib.util import find_spec
-from numbers import Real
 from pathlib import Path
 
 import numpy as np
@@ -22,9 +21,10 @@ from taisoft.mesh.obj_off import read_obj, read_off
 from taisoft.mesh.ply import read_ply
 from taisoft.mesh.safe_reading import read_content, run_child
 from taisoft.mesh.stl import read_stl
-from taisoft.mesh.tet_mesh import TetMesh, checked_array
+from taisoft.mesh.tet_mesh import TetMesh, checked_array, checked_points
 from taisoft.mesh.texture import checked_subsets, checked_uvs, subsets_of, transferred
-from taisoft.mesh.topology import Faces, connected_pieces, crack_widths, linked_groups, merge_labels, triangle_edges
+from taisoft.mesh.topology import Faces, connected_pieces, crack_widths, linked_groups, merged_points, triangle_edges
+from taisoft.scene.checks import number
 
 READERS = {".obj": read_obj, ".stl": read_stl, ".ply": read_ply, ".off": read_off}
 FORMATS = tuple(READERS)
@@ -36,7 +36,6 @@ ENVELOPE = 0.1  # default envelope over the edge length
 
 
 @guarded_record("surface", MAKE_ANOTHER, MeshAttributeError)
-@dataclass(frozen=True, eq=False)
 class SurfaceMesh:
     """Triangles in space, checked and read-only.
 
@@ -54,18 +53,13 @@ class SurfaceMesh:
     subsets: dict[str, np.ndarray] = field(default_factory=dict)
 
     def __post_init__(self):
-        vertices = checked_array(self.vertices, "vertices", 3, "fiu", "numbers", self._error).astype(np.float64)
-        bad = np.argwhere(~np.isfinite(vertices))
-        if len(bad):
-            raise MeshError(f"{self.source}: vertex {bad[0, 0]} coordinate {bad[0, 1]} is not finite")
+        vertices = checked_points(self.vertices, self._error)
         triangles = checked_array(self.triangles, "triangles", 3, "iu", "integers", self._error)
         bad = np.argwhere((triangles < 0) | (triangles >= len(vertices)))
         if len(bad):
             t, k = bad[0]
             raise MeshError(f"{self.source}: triangle {t}: vertex {triangles[t, k]} does not exist ({len(vertices)} vertices)")
         triangles, n = triangles.astype(np.int64), len(triangles)
-        for array in (vertices, triangles):
-            array.setflags(write=False)
         texture = {"uvs": checked_uvs(self.uvs, n, self._error), "subsets": checked_subsets(self.subsets, n, self._error)}
         self.__dict__.update(vertices=vertices, triangles=triangles, **texture)  # the only way to store values in a frozen record
 
@@ -198,11 +192,8 @@ def as_surface(mesh, weld: float = 0.0):
 def clean_surface(surface: SurfaceMesh, weld: float) -> SurfaceMesh:
     """Return the surface, welded [m], without degenerate and duplicate triangles; issue its warnings, at the caller's caller."""
     name, points, triangles = surface.source, surface.vertices, surface.triangles
-    if isinstance(weld, bool) or not isinstance(weld, Real) or not 0.0 <= weld < np.inf:
-        raise MeshError(f"{name}: weld must be a distance of at least 0 m, not {weld!r}")
     notes = list(surface.warnings)
-    labels = merge_labels(points, float(weld))
-    first = np.unique(labels, return_index=True)[1]
+    first, labels = merged_points(points, number(weld, f"{name}: weld", minimum=0.0, unit="m", error=MeshError))
     if len(first) < len(points):
         notes.append(f"{len(points) - len(first)} of {len(points)} vertices were welded to another one")
     points, triangles = points[first], labels[triangles]
@@ -236,8 +227,9 @@ def tetrahedralize(surface: SurfaceMesh, edge_length: float | None = None, envel
     if not isinstance(surface, SurfaceMesh):
         raise MeshError(f"tetrahedralize needs a SurfaceMesh (see read_surface), not {type(surface).__name__}")
     name, diagonal = surface.source, float(np.linalg.norm(np.ptp(surface.vertices, axis=0)))
-    edge_length = _checked_length(name, "edge_length", edge_length, diagonal / EDGES_PER_DIAGONAL, diagonal)
-    envelope = _checked_length(name, "envelope", envelope, ENVELOPE * edge_length, diagonal)
+    lengths = {"above": 0.0, "below": diagonal, "unit": "m, the surface's diagonal", "error": MeshError}
+    edge_length = diagonal / EDGES_PER_DIAGONAL if edge_length is None else number(edge_length, f"{name}: edge_length", **lengths)
+    envelope = ENVELOPE * edge_length if envelope is None else number(envelope, f"{name}: envelope", **lengths)
     if find_spec("wildmeshing") is None:
         raise MeshError(f"{name}: tetrahedralize needs the package wildmeshing: pip install 'taisoft[mesh]'")
     faults = surface.faults()
@@ -267,14 +259,6 @@ def tetrahedralize(surface: SurfaceMesh, edge_length: float | None = None, envel
         text += "; the closing surface may be rough and bulge beyond the envelope"
         warnings.warn(f"{name}: {text}", UserWarning, stacklevel=2)
     return mesh
-
-
-def _checked_length(name: str, what: str, value, default: float, diagonal: float) -> float:
-    if value is None:
-        return default
-    if isinstance(value, bool) or not isinstance(value, (int, float, np.number)) or not 0.0 < value < diagonal:
-        raise MeshError(f"{name}: {what} must be a length above 0 and below the diagonal, {diagonal:.4g} m, not {value!r}")
-    return float(value)
 
 
 def _run_mesher(name: str, vertices: np.ndarray, triangles: np.ndarray, length: float, envelope: float):

@@ -12,11 +12,11 @@ from collections.abc import Callable
 import numpy as np
 
 from taisoft.attributes import Guarded, MeshAttributeError
-from taisoft.errors import MeshError, listed, one_line
+from taisoft.errors import MeshError, listed
 from taisoft.machine import require
 from taisoft.mesh.fibres import FIBRES, checked_fibres
 from taisoft.mesh.quality import edge_lengths, mean_ratio
-from taisoft.mesh.regions import checked_names, checked_regions, region_id, region_text
+from taisoft.mesh.regions import as_array, checked_names, checked_regions, region_id, region_text
 from taisoft.mesh.texture import checked_subsets, checked_uvs
 from taisoft.mesh.topology import (
     Faces,
@@ -25,7 +25,7 @@ from taisoft.mesh.topology import (
     first_repeated_tet,
     joint_edges,
     joint_vertices,
-    merge_labels,
+    merged_points,
 )
 
 DEGENERATE = 1e-9  # a tet has no volume if it is below this times its longest edge cubed
@@ -39,16 +39,26 @@ COINCIDENT = 1e-9  # vertices closer than this times the mesh's diagonal are coi
 
 def checked_array(values, what: str, width: int, kinds: str, kinds_text: str, error: Callable[[str], MeshError]) -> np.ndarray:
     """Return values as an array (n, width) of these kinds with at least one row. error: makes an error of its text."""
-    try:
-        array = np.asarray(values)
-    except (ValueError, TypeError, OverflowError) as reason:
-        raise error(f"{what} must be an array of {kinds_text}: {one_line(str(reason))}") from reason
+    array = as_array(values, what, kinds_text, error)
     if array.size == 0:
         raise error(f"no {what} found")
     if array.dtype.kind not in kinds:
         raise error(f"{what} must be {kinds_text}, not {array.dtype}")
     if array.ndim != 2 or array.shape[1] != width:
         raise error(f"{what} must have shape ({'n' if width == 3 else 'm'}, {width}), not {array.shape}")
+    return array
+
+
+def checked_points(points, error: Callable[[str], MeshError], what: str = "vertices", one: str = "vertex") -> np.ndarray:
+    """Return an (n,3) float64 copy of finite coordinates. error: makes an error of its text."""
+    array = np.array(checked_array(points, what, 3, "fiu", "numbers", error), dtype=np.float64, order="C")
+    for bad, rule in (
+        (~np.isfinite(array), "is not finite"),
+        (np.abs(array) > LARGEST_COORDINATE, "is {:g} m, too large for a 32-bit float"),
+    ):
+        if bad.any():
+            i, k = np.argwhere(bad)[0]
+            raise error(f"{one} {i} coordinate {k} {rule.format(array[i, k])}")
     return array
 
 
@@ -97,14 +107,14 @@ class TetMesh(Guarded):
         self.source = source
         self.recipe: dict | None = None
         self.warnings: list[str] = []
-        self.vertices = self._checked_points(vertices)
+        self.vertices = checked_points(vertices, self._mesh_error)
         self.tets = self._checked_tets(tets)
         self.volumes = self._oriented_volumes(fix_orientation)
         self.regions = checked_regions(regions, self.n_tets, self._mesh_error)
         self.region_ids = () if self.regions is None else tuple(np.unique(self.regions).tolist())
         self.region_names = checked_names(region_names, self.region_ids, self._mesh_error)
         self.fibres = checked_fibres(fibres, self.n_tets, self._mesh_error)
-        self.mid_edge = None if mid_edge is None else self._checked_points(mid_edge, "mid_edge", "mid_edge")
+        self.mid_edge = None if mid_edge is None else checked_points(mid_edge, self._mesh_error, "mid_edge", "mid_edge")
         if mid_edge is not None and len(self.mid_edge) != (n := len(distinct_edges(self.tets)[0])):
             raise self._mesh_error(f"mid_edge has {len(self.mid_edge)} rows for {n} edges")
         self._region_of = {key: one for one in self.region_ids for key in (one, self.region_names.get(one, one))}
@@ -216,19 +226,6 @@ class TetMesh(Guarded):
         self.warnings.append(text)
         warnings.warn(self._named(text), UserWarning, stacklevel=4)
 
-    def _checked_points(self, points, what: str = "vertices", one: str = "vertex") -> np.ndarray:
-        """Return an (n,3) float64 copy of finite coordinates."""
-        array = checked_array(points, what, 3, "fiu", "numbers", self._mesh_error)
-        array = np.array(array, dtype=np.float64, order="C")
-        for bad, rule in (
-            (~np.isfinite(array), "is not finite"),
-            (np.abs(array) > LARGEST_COORDINATE, "is {:g} m, too large for a 32-bit float"),
-        ):
-            if bad.any():
-                i, k = np.argwhere(bad)[0]
-                raise self._mesh_error(f"{one} {i} coordinate {k} {rule.format(array[i, k])}")
-        return array
-
     def _checked_tets(self, tets) -> np.ndarray:
         """Return an (m,4) int64 copy: valid indices, no repeated vertex in a tet, no duplicate tet, no unused vertex."""
         array = checked_array(tets, "tets", 4, "iu", "integers", self._mesh_error)
@@ -326,8 +323,7 @@ class TetMesh(Guarded):
 
     def _warn_coincident(self) -> None:
         """Warn of vertices that coincide with another one; they do not connect their tets."""
-        labels = merge_labels(self.vertices, COINCIDENT * float(np.linalg.norm(np.ptp(self.vertices, axis=0))))
-        first = np.unique(labels, return_index=True)[1]
+        first, labels = merged_points(self.vertices, COINCIDENT * float(np.linalg.norm(np.ptp(self.vertices, axis=0))))
         extra = np.setdiff1d(np.arange(self.n_verts), first)
         if len(extra):
             original = int(first[labels[extra[0]]])

@@ -17,7 +17,7 @@ CHUNK = 128  # triangles that get UVs at once, each with some hundred triangles 
 
 
 def checked_uvs(uvs, n: int, error: Callable[[str], MeshError]) -> np.ndarray | None:
-    """Return read-only UVs (n,3,2) float64 of n triangles, or None for None. error: makes an error of its text."""
+    """Return a copy of UVs (n,3,2) float64 of n triangles, or None for None. error: makes an error of its text."""
     if uvs is None:
         return None
     array = np.array(uvs)
@@ -25,9 +25,7 @@ def checked_uvs(uvs, n: int, error: Callable[[str], MeshError]) -> np.ndarray | 
         raise error(f"uvs must be numbers of shape ({n}, 3, 2), two for each corner, not {array.dtype} of shape {array.shape}")
     if len(bad := np.argwhere(~np.isfinite(array))):
         raise error(f"uvs of triangle {bad[0, 0]}, corner {bad[0, 1]} are not finite")
-    array = array.astype(np.float64)
-    array.setflags(write=False)
-    return array
+    return array.astype(np.float64)
 
 
 def checked_subsets(subsets, n: int, error: Callable[[str], MeshError]) -> dict[str, np.ndarray]:
@@ -71,11 +69,8 @@ def transferred(surface, vertices: np.ndarray, triangles: np.ndarray) -> tuple[n
     rows = np.flatnonzero(normals_and_heights(surface.vertices, surface.triangles)[1] > 0.0)
     source = Triangles(surface.vertices, surface.triangles[rows])
     given = np.zeros((len(rows), 3, 2)) if surface.uvs is None else surface.uvs[rows]
-    edges, nearest, uvs = (
-        _uv_edges(source.triangles, given),
-        np.empty(len(triangles), dtype=np.int64),
-        np.empty((len(triangles), 3, 2)),
-    )
+    edges = _uv_edges(source.triangles, given)
+    nearest, uvs = np.empty(len(triangles), dtype=np.int64), np.empty((len(triangles), 3, 2))
     for first in range(0, len(triangles), CHUNK):
         at = slice(first, first + CHUNK)
         nearest[at], points, found = _located(source, edges, vertices[triangles[at]])

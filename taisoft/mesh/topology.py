@@ -170,10 +170,10 @@ def joint_vertices(tets: np.ndarray, faces: Faces) -> np.ndarray:
     return vertices[counts > 1]
 
 
-def merge_labels(points: np.ndarray, tolerance: float) -> np.ndarray:
-    """Return labels (n,), from 0: points at most `tolerance` [m] apart, directly or through others, share a label.
+def merged_points(points: np.ndarray, tolerance: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return the first point of each group of points, (k,) ascending, and the group (n,) of each point.
 
-    points: (n,3) [m]. Labels follow the order in which a group first appears.
+    points: (n,3) [m]. Points at most `tolerance` [m] apart, directly or through others, are in one group.
     """
     # Merge equal points first: n of them in one place would make n^2 pairs.
     distinct, labels = np.unique(points + 0.0, axis=0, return_inverse=True)  # + 0.0 makes -0.0 equal to 0.0
@@ -184,7 +184,7 @@ def merge_labels(points: np.ndarray, tolerance: float) -> np.ndarray:
     first, inverse = np.unique(labels, return_index=True, return_inverse=True)[1:]
     rank = np.empty(len(first), dtype=np.int64)
     rank[np.argsort(first)] = np.arange(len(first))
-    return rank[inverse.ravel()]
+    return np.sort(first), rank[inverse.ravel()]
 
 
 def crack_widths(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:

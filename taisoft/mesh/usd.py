@@ -16,6 +16,7 @@ from taisoft.mesh.placing import FROM_Y_UP
 from taisoft.mesh.safe_reading import SECONDS, SECONDS_PER_BYTE, WALL_FACTOR, read_content, run_child
 from taisoft.mesh.surface_mesh import SurfaceMesh, clean_surface, tetrahedralize
 from taisoft.mesh.tet_mesh import TetMesh
+from taisoft.scene.checks import choice
 
 USD_FORMATS = (".usd", ".usda", ".usdc", ".usdz")
 
@@ -74,8 +75,7 @@ def _read_prims(path, what: str, alone: bool, up: str) -> tuple[Path, dict[str, 
     file = as_path(path, what, MeshError)
     if file.suffix.lower() not in USD_FORMATS:
         raise MeshError(f"{file}: a USD stage is read from {', '.join(USD_FORMATS)}, not from {file.suffix or 'no ending'}")
-    if up not in FROM_Y_UP:
-        raise MeshError(f"{what}: up must be one of {', '.join(FROM_Y_UP)}, not {value_text(up)}")
+    choice(up, f"{what}: up", FROM_Y_UP, MeshError)
     seconds = SECONDS + SECONDS_PER_BYTE * len(read_content(file))
     task = "lone_usd" if alone else "usd"
     with tempfile.TemporaryDirectory(prefix="taisoft-") as folder:

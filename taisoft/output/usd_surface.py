@@ -208,7 +208,7 @@ def define_body(stage, body, legal_name: str, srgb: np.ndarray, first: int, touc
         finish(gprim, x)
         define_primvar(gprim, STRESS, scalars, "von Mises equivalent of the mean Cauchy stress at the node [Pa]")
         if errors:
-            define_primvar(gprim, ERROR, scalars, "estimated error of the node's position [m], 0 where unknown")
+            define_primvar(gprim, ERROR, scalars, "estimated error of the node's position [m], -1 where unknown")
     touching = touching and skin is None and body.nodes.embedded is None  # impulses act on the nodes of tets
     if touching:
         define_primvar(surface, IMPULSE, vectors, "impulse of the contacts of the last step on the node [N s]")

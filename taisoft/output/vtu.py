@@ -89,30 +89,27 @@ class Grid:
     def __init__(self, scene):
         self._names, self._start = [body.name for body in scene.bodies], start_positions(scene)
         self._has_fibres = any(body.fibres is not None for body in scene.bodies)
-        connectivity, sizes, body, region, tet, first, n_tet = [], [], [], [], [], 0, 0
+        connectivity, of_cells, first, n_tet = [], [], 0, 0
         for k, one in enumerate(scene.bodies):
             n_tets, regions = one.mesh.n_tets, one.mesh.regions
             tets = np.arange(n_tet, n_tet + n_tets)
             parts = [] if isinstance(one, RigidBody) else [(one.nodes.elements, tets, 0 if regions is None else regions)]
             if one.nodes.embedded is not None:
-                parts.append((one.nodes.surface, np.full(len(one.nodes.surface), -1), 0))
-            for elements, of_cells, of_region in parts:
+                parts.append((one.nodes.surface, -1, 0))
+            for elements, tet, region in parts:
                 order = VTK_ORDER if elements.shape[1] == 10 else slice(None)
                 connectivity.append((first + elements[:, order]).ravel())
-                sizes.append(np.full(len(elements), elements.shape[1]))
-                body.append(np.full(len(elements), k))
-                tet.append(of_cells)
-                region.append(np.broadcast_to(of_region, len(elements)))
+                of_cells.append(np.broadcast_arrays(np.full(len(elements), elements.shape[1]), k, tet, region))
             first, n_tet = first + one.n_nodes, n_tet + n_tets
-        sizes, self._tet = np.concatenate(sizes), np.concatenate(tet)  # of each cell, -1 for triangles
+        sizes, body, self._tet, region = np.concatenate(of_cells, axis=1)  # of each cell, tet -1 for triangles
         self.cells = {
             "connectivity": np.concatenate(connectivity).astype(np.int64),
             "offsets": np.cumsum(sizes, dtype=np.int64),
             "types": np.array([CELL_TYPES.get(n, 0) for n in range(11)], dtype=np.uint8)[sizes],
         }
-        self.cell_data = {"body": np.concatenate(body).astype(np.int32)}
+        self.cell_data = {"body": body.astype(np.int32)}
         if any(one.mesh.regions is not None for one in scene.bodies):
-            self.cell_data["region"] = np.concatenate(region).astype(np.int32)
+            self.cell_data["region"] = region.astype(np.int32)
 
     @functools.cached_property
     def _encoded(self) -> list[list[str]]:

@@ -2,25 +2,24 @@
 
 import warnings
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from types import MappingProxyType
 from typing import ClassVar
 
 import numpy as np
 
 from taisoft.attributes import Guarded, guarded_record, thawed
-from taisoft.errors import MeshError, SceneError, reworded, value_text
+from taisoft.errors import SceneError, value_text
 from taisoft.mesh import quadratic
 from taisoft.mesh.nodes import Nodes, make_nodes
-from taisoft.mesh.solids import is_closed
 from taisoft.mesh.tet_mesh import TetMesh
 from taisoft.mesh.thickness import coarse_bending
 from taisoft.scene import checks
+from taisoft.scene.body_loads import activate, add_cavity, add_force, add_pressure, add_traction, enclosed_volume
 from taisoft.scene.collision import CONTACT_MODES
 from taisoft.scene.composition import Composition, compose
 from taisoft.scene.curves import Curve, check_shape, middle_nodes
 from taisoft.scene.key_frames import AT_REST, KeyFrames, NodePath
-from taisoft.scene.loads import LOADS, Activation, Cavity, Load, NodalForce, Pressure, Traction, value_or_path
+from taisoft.scene.loads import LOADS, Activation, Cavity, Load, NodalForce, Pressure, Traction
 from taisoft.scene.look import colour_or_none, opacity_of
 from taisoft.scene.material import Material
 from taisoft.scene.skins import Skin, embed
@@ -40,7 +39,6 @@ _SET["cavity"] = f"call sim.set_cavity(name, value) for an existing one; otherwi
 
 
 @guarded_record("constraint", "add another one by body.fix or body.move")
-@dataclass(frozen=True, eq=False)
 class Constraint:
     """Nodes prescribed along some axes: at their start position, or at that plus a time-dependent displacement."""
 
@@ -48,9 +46,6 @@ class Constraint:
     axes: np.ndarray  #: (3,) bool
     path: Callable | None = None  #: t [s] -> displacement (3,) or (k,3) [m], None once released; no path: the nodes stay
     where: Callable | None = None  #: the function that selected the nodes, if any: it can select again on another mesh
-
-    def __post_init__(self):
-        checks.store(self, nodes=self.nodes, axes=self.axes)
 
 
 def tet_number(name: str, doc: str) -> property:
@@ -121,9 +116,8 @@ class Body(Guarded):
     ):
         """The arguments of `Scene.add_body`; numbers: young, poisson and density, if they replace the material's."""
         what = f"body {name!r}"
-        if not isinstance(mesh, TetMesh):
-            raise SceneError(f"{what}: mesh must be a TetMesh, not {type(mesh).__name__}")
-        self.name, self.mesh, self.composition = name, mesh, compose(what, mesh, material, fibres, **numbers)
+        self.name, self.mesh = name, checks.instance(mesh, f"{what}: mesh", TetMesh)
+        self.composition = compose(what, mesh, material, fibres, **numbers)
         self.order = checks.whole(order, f"{what}: order", tuple(QUADRATURE_DEGREES))
         degrees = QUADRATURE_DEGREES[self.order]
         degree = degrees[0] if quadrature_degree is None else quadrature_degree
@@ -147,9 +141,6 @@ class Body(Guarded):
     def _label(self) -> str:
         return f"body {self.name!r}"
 
-    def _check_position(self, value) -> np.ndarray:
-        return checks.array(value, f"{self._label()}: position", ((3,),))
-
     def _check_velocity(self, value) -> np.ndarray:
         return checks.array(value, f"{self._label()}: velocity", ((3,), (self.n_nodes, 3)))
 
@@ -158,17 +149,11 @@ class Body(Guarded):
             raise SceneError(f"{self._label()}: collision: an embedded surface has no distance field")
         return checks.choice(value, f"{self._label()}: collision", CONTACT_MODES)
 
-    position = checks.attribute("position", _check_position, "Initial translation (3,) [m].")
-    velocity = checks.attribute("velocity", _check_velocity, "Initial velocity (3,) or (n,3) [m/s].")
-    collision = checks.attribute("collision", _check_collision, "Contact geometry, one of CONTACT_MODES.")
-    colour = checks.attribute(
-        "colour",
-        lambda self, value: colour_or_none(value, f"{self._label()}: colour"),
-        'sRGB (3,) in [0, 1], also set as "#rrggbb"; None: one of the palette.',
-    )
-    opacity = checks.attribute(
-        "opacity", lambda self, value: opacity_of(value, f"{self._label()}: opacity"), "Of its surface: 1 hides what is behind."
-    )
+    position = checks.attribute("position", checks.vector, "Initial translation (3,) [m].")
+    velocity = checks.attribute("velocity", None, "Initial velocity (3,) or (n,3) [m/s].")
+    collision = checks.attribute("collision", None, "Contact geometry, one of CONTACT_MODES.")
+    colour = checks.attribute("colour", colour_or_none, 'sRGB (3,) in [0, 1], also set as "#rrggbb"; None: one of the palette.')
+    opacity = checks.attribute("opacity", opacity_of, "Of its surface: 1 hides what is behind.")
 
     @property
     def rest_positions(self) -> np.ndarray:
@@ -260,7 +245,7 @@ class Body(Guarded):
 
     def check(self) -> None:
         """Raise SceneError if in-place changes made the arrays of position or velocity invalid, or its law is another one now."""
-        self._check_position(self.position)
+        checks.vector(self.position, f"{self._label()}: position")
         self._check_velocity(self.velocity)
         for material in self.composition.materials.values():
             material.check_law(self._label())
@@ -317,7 +302,8 @@ class Body(Guarded):
         rows = self.selectable
         return rows.start + checks.selection(where, self.rest_positions[rows], what, "node", repeats=repeats)
 
-    embed = embed
+    add_traction, add_pressure, add_force, add_cavity = add_traction, add_pressure, add_force, add_cavity
+    enclosed_volume, activate, embed = enclosed_volume, activate, embed
 
     @property
     def riding_skin(self) -> Skin | None:
@@ -330,10 +316,9 @@ class Body(Guarded):
         where: node ids, a bool mask (n,), or a callable that gets the rest positions (n,3) and returns such a mask.
         axes: the fixed directions, such as "y" or "xz". Raises SceneError if no node is chosen or one is moved already.
         """
-        self._check_open("fix")
-        what = f"{self._label()}: fix"
+        what = self._check_open("fix")
         nodes = self.select_nodes(where, what)
-        return self._add_constraint(Constraint(nodes, checks.axes(axes, what), None, _callable_or_none(where)), what)
+        return self._add_constraint(Constraint(nodes, checks.axes(axes, what), None, where if callable(where) else None), what)
 
     def move(self, where, path: Callable | KeyFrames | None = None, axes: str = "xyz") -> Constraint:
         """Move nodes along a prescribed path, or hold them until `Simulator.set_displacement` moves them.
@@ -343,8 +328,7 @@ class Body(Guarded):
         pivot is in start coordinates. None: they stay until a command. axes: the prescribed directions. Raises SceneError if no
         node is chosen, one is fixed or moved already, or the path is invalid.
         """
-        self._check_open("move")
-        what = f"{self._label()}: move"
+        what = self._check_open("move")
         nodes = self.select_nodes(where, what, repeats=False)
         mask, path = checks.axes(axes, what), AT_REST if path is None else path
         if isinstance(path, KeyFrames):
@@ -353,124 +337,7 @@ class Body(Guarded):
             raise SceneError(f"{what}: path must be a function of time, not {value_text(path)}")
         if checks.path_value(path, 0.0, what, "displacement", ((3,), (len(nodes), 3))) is None:
             raise SceneError(f"{what}: the path must give a displacement at t = 0, not None")
-        return self._add_constraint(Constraint(nodes, mask, path, _callable_or_none(where)), what)
-
-    def add_traction(self, where, traction) -> Traction:
-        """Apply a dead load per reference area to surface triangles.
-
-        where: rows of mesh.surface, a bool mask (t,), or a callable that gets the triangles' centroids at rest (t,3)
-        and returns such a mask. traction: (3,) [Pa], or its path: callable t [s] -> (3,), called once here for t = 0, or
-        `KeyFrames`, whose translations are the values. Raises SceneError if no triangle is chosen or a number is not finite.
-        """
-        self._check_open("add_traction")
-        what = f"{self._label()}: add_traction"
-        load = Traction(self._triangles(where, what), **value_or_path(traction, what, "traction", ((3,),)))
-        list.append(self.tractions, load)
-        return load
-
-    def add_pressure(self, where, pressure) -> Pressure:
-        """Apply a pressure that acts along the deformed inward normal of surface triangles, and on their deformed area.
-
-        where: as for `add_traction`. pressure: [Pa], a number, negative for suction, or its path: callable t [s] -> number,
-        called once here for t = 0, or `KeyFrames` with values. Pressures on the same triangle add. Raises SceneError if no
-        triangle is chosen or a number is not finite.
-        """
-        self._check_open("add_pressure")
-        what = f"{self._label()}: add_pressure"
-        triangles = self._triangles(where, what)
-        given = value_or_path(pressure, what, "pressure", ((),))
-        load = Pressure(**given, triangles=triangles, closed=is_closed(self.mesh.surface[triangles]))
-        list.append(self.pressures, load)
-        return load
-
-    def add_cavity(self, where, pressure=None, volume=None, name: str | None = None) -> Cavity:
-        """Fill a cavity with a fluid of given pressure, or with an incompressible fluid of given volume.
-
-        where: its surface triangles, as for `add_traction`: closed, with normals into the cavity. pressure: [Pa] above the
-        ambient pressure, as for `add_pressure`. volume: [m^3], above 0, a number or a path; the pressure then follows, in
-        implicit Euler and BDF2 steps and in statics. name: unique in the scene; by default "NAME cavity 0" and so on, NAME the
-        body's. A triangle belongs to one cavity at most. Raises SceneError.
-        """
-        self._check_open("add_cavity")
-        what = f"{self._label()}: add_cavity"
-        if (pressure is None) == (volume is None):
-            raise SceneError(f"{what}: give either a pressure or a volume")
-        own = [cavity.name for cavity in self.cavities]
-        if name is None:
-            name = next(free for k in range(len(own) + 1) if (free := f"{self.name} cavity {k}") not in own)
-        name = checks.name(name, f"{what}: name", own)
-        triangles = self._triangles(where, what)
-        if not is_closed(self.mesh.surface[triangles]):
-            raise SceneError(f"{what}: the chosen triangles have a border: they must enclose the cavity")
-        for other in self.cavities:
-            if len(shared := np.intersect1d(triangles, other.triangles)):
-                raise SceneError(f"{what}: surface triangle {shared[0]} of cavity {name!r} belongs to cavity {other.name!r}")
-        rest_volume = self._enclosed(triangles)
-        if rest_volume <= 0.0:
-            raise SceneError(f"{what}: the normals of the chosen triangles point outward: they must point into the cavity")
-        given = "pressure" if volume is None else "volume"
-        content = value_or_path(pressure if volume is None else volume, what, given, ((),))
-        cavity = Cavity(**content, name=name, triangles=triangles, given=given, rest_volume=rest_volume)
-        check_volume(cavity, f"{what}: volume")
-        list.append(self.cavities, cavity)
-        return cavity
-
-    def enclosed_volume(self, where) -> float:
-        """Return the volume [m^3] at rest of the cavity with these surface triangles, chosen as for `add_cavity`."""
-        return self._enclosed(self._triangles(where, f"{self._label()}: enclosed_volume"))
-
-    def _enclosed(self, triangles: np.ndarray) -> float:
-        x = self.rest_positions[self.face_nodes(triangles)]
-        x = x - x[0, 0]
-        if not self.is_curved:
-            return -float(np.linalg.det(x[:, :3]).sum()) / 6.0
-        points = np.einsum("tax,aq->tqx", x, quadratic.triangle_rule(2)[1])
-        return -float((points * quadratic.area_vectors(x)).sum()) / 3.0
-
-    def _triangles(self, where, what: str) -> np.ndarray:
-        """Return the chosen rows of mesh.surface, by their centroids at rest."""
-        centroids = self.mesh.vertices[self.mesh.surface].mean(axis=1)
-        return checks.selection(where, centroids, what, "surface triangle")
-
-    def activate(self, activation, region: int | str | None = None) -> None:
-        """Activate the fibres of the body, or those of one region of its mesh, given by name or id; it replaces what was given.
-
-        activation: a number from 0 to 1, or its path: callable t [s] -> number, called once here for t = 0, or `KeyFrames` with
-        values. Raises SceneError if the body has no fibres, or the region or the activation is invalid.
-        """
-        self._check_open("activate")
-        self._activate(activation, region, f"{self._label()}: activate")
-
-    def _activate(self, activation, region: int | str | None, what: str) -> None:
-        """As `activate`, also during a run. what: start of messages."""
-        if self.fibres is None:
-            raise SceneError(f"{what}: it has no fibres: give add_body fibres")
-        given = value_or_path(activation, what, "activation", ((),))
-        known = [given["value"] if given["value"] is not None else given["path"](0.0)]
-        known += list(activation.values) if isinstance(activation, KeyFrames) else []
-        for value in map(float, known):
-            if not 0.0 <= value <= 1.0:
-                raise SceneError(f"{what}: an activation must lie from 0 to 1, not {value:g}")
-        with reworded(MeshError, f"{what}: ", raised=SceneError):
-            key = None if region is None else self.mesh.region_id(region)
-        with thawed(self):
-            self.activations = tuple(
-                Activation(**given, region=one.region) if key in (None, one.region) else one for one in self.activations
-            )
-
-    def add_force(self, where, force) -> NodalForce:
-        """Apply a dead load to nodes: a total force distributed by lumped mass, or one force per node.
-
-        where: as for `fix`; a node chosen twice counts once. force: (3,) the total, or (k,3) in the order of the chosen
-        nodes [N], or its path, as for `add_traction`. Raises SceneError if no node is chosen or numbers are not finite.
-        """
-        self._check_open("add_force")
-        what = f"{self._label()}: add_force"
-        nodes = self.select_nodes(where, what)
-        given = value_or_path(force, what, "force", ((3,), (len(nodes), 3)))
-        load = NodalForce(nodes, where=_callable_or_none(where), **given)
-        list.append(self.forces, load)
-        return load
+        return self._add_constraint(Constraint(nodes, mask, path, where if callable(where) else None), what)
 
     def _add_constraint(self, constraint: Constraint, what: str) -> Constraint:
         """Add a constraint. Raises SceneError if a node and axis is constrained already; only repeated fixes are allowed."""
@@ -482,16 +349,4 @@ class Body(Guarded):
             if len(axes) and len(nodes):
                 verb = "fixed" if earlier.path is None else "moved"
                 raise SceneError(f"{what}: node {nodes[0]} is already {verb} along {'xyz'[axes[0]]}")
-        list.append(self.constraints, constraint)
-        return constraint
-
-
-def check_volume(cavity: Cavity, what: str) -> None:
-    """Raise SceneError if a volume is not above 0; of a path, at t = 0."""
-    start = cavity.value if cavity.path is None else cavity.path(0.0)
-    if cavity.given == "volume" and float(start) <= 0.0:
-        raise SceneError(f"{what} must be above 0, not {float(start):g}")
-
-
-def _callable_or_none(where) -> Callable | None:
-    return where if callable(where) else None
+        return self._add(self.constraints, constraint)

@@ -1,7 +1,7 @@
-"""Validate values given to a scene and its `solver` dict: arguments of Simulator, and the run's seconds and fps.
+"""Validate values given to meshes, to a scene, and to its `solver` dict: arguments of Simulator, and the run's seconds and fps.
 
-Each check returns the converted value or raises SceneError with one sentence that starts with `what`. The Simulator itself
-validates names of integrators and contact solvers and their combinations.
+Each check returns the converted value or raises SceneError, or the given error, with one sentence that starts with `what`. The
+Simulator itself validates names of integrators and contact solvers and their combinations.
 """
 
 import difflib
@@ -18,8 +18,8 @@ UNIT_TOLERANCE = 8 * np.finfo(np.float64).eps  # squared lengths this close to 1
 MAX_TOLERANCE = {"newton_tolerance": 0.1}  # a residual of a tenth of the forces is no solution; others: 1
 
 
-def number(value, what: str, *, above=None, minimum=None, maximum=None, unit: str = "", error=SceneError) -> float:
-    """Return value as a finite float in the 32-bit range, > above, >= minimum, <= maximum where given; or raise the error."""
+def number(value, what: str, *, above=None, minimum=None, maximum=None, below=None, unit: str = "", error=SceneError) -> float:
+    """Return value as a finite float in the 32-bit range, > above, >= minimum, <= maximum, < below where given."""
     value = value[()] if isinstance(value, np.ndarray) and value.ndim == 0 else value
     if isinstance(value, (bool, np.bool_)) or not isinstance(value, Real):
         raise error(f"{what} must be a number, not {value_text(value)}")
@@ -29,7 +29,8 @@ def number(value, what: str, *, above=None, minimum=None, maximum=None, unit: st
         result = float("inf")
     if not np.isfinite(result):
         raise error(f"{what} must be finite, not {value_text(value)}")
-    rules = (("greater than", operator.gt, above), ("at least", operator.ge, minimum), ("at most", operator.le, maximum))
+    rules = [("greater than", operator.gt, above), ("at least", operator.ge, minimum)]
+    rules += [("at most", operator.le, maximum), ("below", operator.lt, below)]
     rules = [rule for rule in rules if rule[2] is not None]
     if not all(holds(result, limit) for _, holds, limit in rules):
         rule = " and ".join(f"{words} {limit:g}" for words, _, limit in rules)
@@ -39,7 +40,7 @@ def number(value, what: str, *, above=None, minimum=None, maximum=None, unit: st
     return result
 
 
-def array(value, what: str, shapes: tuple[tuple[int, ...], ...]) -> np.ndarray:
+def array(value, what: str, shapes: tuple[tuple[int, ...], ...], error: Callable[[str], Exception] = SceneError) -> np.ndarray:
     """Return a float64 copy of finite numbers in one of the shapes. what: start of the message."""
     shapes_text = " or ".join(str(shape) for shape in shapes)
     numbers_text = "a number" if shapes == ((),) else f"numbers of shape {shapes_text}"
@@ -48,17 +49,25 @@ def array(value, what: str, shapes: tuple[tuple[int, ...], ...]) -> np.ndarray:
     except (ValueError, TypeError, OverflowError):
         result = np.empty(0, dtype=object)
     if result.dtype.kind not in "fiu":
-        raise SceneError(f"{what} must be {numbers_text}, not {value_text(value)}")
+        raise error(f"{what} must be {numbers_text}, not {value_text(value)}")
     if result.shape not in shapes and shapes == ((),):
-        raise SceneError(f"{what} must be a number, not of shape {result.shape}")
+        raise error(f"{what} must be a number, not of shape {result.shape}")
     if result.shape not in shapes:
-        raise SceneError(f"{what} must have shape {shapes_text}, not {result.shape}")
+        raise error(f"{what} must have shape {shapes_text}, not {result.shape}")
     result = np.array(result, dtype=np.float64)
     for rule, bad in (("not finite", ~np.isfinite(result)), ("too large for a 32-bit float", np.abs(result) > LARGEST)):
         if bad.any():
             at = np.argwhere(bad)[0]
             entry = f"{what}: entry {at.tolist()}" if result.ndim else what
-            raise SceneError(f"{entry} is {result[tuple(at)]:g}, {rule}")
+            raise error(f"{entry} is {result[tuple(at)]:g}, {rule}")
+    return result
+
+
+def vector(value, what: str, above: float | None = None, error: type[Exception] = SceneError) -> np.ndarray:
+    """Return a float64 copy of three finite numbers, > above where given. what: start of the message."""
+    result = array(value, what, ((3,),), error)
+    if above is not None and not (result > above).all():
+        raise error(f"{what} must be greater than {above:g}, not {value_text(value)}")
     return result
 
 
@@ -87,21 +96,23 @@ def path_value(path: Callable, t: float, what: str, quantity: str, shapes: tuple
     return None if value is None else array(value, f"{what}: the path's {quantity} at t = {t:g}", shapes)
 
 
-def length(value) -> int:
-    """Return the number of rows of a value that should be an array; 0 if it has none."""
-    try:
-        return len(value)
-    except TypeError:
-        return 0
+def times(value, what: str) -> np.ndarray:
+    """Return ascending times (k,) [s], k > 0."""
+    k = value.size if isinstance(value, np.ndarray) else len(value) if hasattr(value, "__len__") else 1
+    result = array(value, what, ((max(k, 1),),))
+    if (descends := np.diff(result) <= 0.0).any():
+        first = int(np.argmax(descends))
+        raise SceneError(f"{what} must ascend, but {result[first + 1]:g} follows {result[first]:g}")
+    return result
 
 
-def choice(value, what: str, allowed: tuple[str, ...]) -> str:
+def choice(value, what: str, allowed: Sequence[str], error: type[Exception] = SceneError) -> str:
     """Return value if it is one of the allowed words; otherwise the message suggests the closest one."""
     if isinstance(value, str) and value in allowed:
         return value
     near = difflib.get_close_matches(value.lower(), allowed, n=1) if isinstance(value, str) and len(allowed) > 2 else []
     hint = f"; did you mean {near[0]!r}?" if near else ""
-    raise SceneError(f"{what} must be one of {', '.join(allowed)}, not {value_text(value)}{hint}")
+    raise error(f"{what} must be one of {', '.join(allowed)}, not {value_text(value)}{hint}")
 
 
 def nearest(name: str, known) -> str:
@@ -112,9 +123,8 @@ def nearest(name: str, known) -> str:
 
 def index(name, known: Sequence[str], what: str, error=SceneError) -> int:
     """Return the index of a known name. what: start of the message, such as "robot 'arm': no joint"; or raise the error."""
-    if name not in known:
-        there_are = f"; there are {', '.join(known)}" if known else ""
-        raise error(f"{what} is called {value_text(name)}{nearest(str(name), known)}{there_are}")
+    if not isinstance(name, str) or name not in known:
+        raise error(f"{what} is called {value_text(name)}{nearest(str(name), known)}; there are {', '.join(known) or 'none'}")
     return list(known).index(name)
 
 
@@ -134,6 +144,13 @@ def whole(value, what: str, allowed: tuple[int, ...] | range) -> int:
     return int(value)
 
 
+def instance(value, what: str, kind: type, optional: bool = False):
+    """Return value if it is of a kind, or None where that is allowed."""
+    if not isinstance(value, kind) and not (optional and value is None):
+        raise SceneError(f"{what} must be a {kind.__name__}{' or None' * optional}, not {type(value).__name__}")
+    return value
+
+
 def text(value, what: str) -> str:
     """Return value if it is a string."""
     if not isinstance(value, str):
@@ -150,11 +167,14 @@ def name(value, what: str, taken: list[str]) -> str:
     return value
 
 
-def free_name(value, kind: str, taken: list[str]) -> str:
-    """Return value as a `name` of a scene's kind of thing, or, if it is None, the first free one of kind0, kind1 and so on."""
+def free_name(value, kind: str, taken: list[str], what: str = "") -> str:
+    """Return value as a `name` of a scene's kind of thing, or, if it is None, the first free one of kind0, kind1 and so on.
+
+    what: start of messages, by default that of the scene.
+    """
     if value is None:
         value = next(free for free in (f"{kind}{i}" for i in range(len(taken) + 1)) if free not in taken)
-    return name(value, f"scene: {kind} name", taken)
+    return name(value, what or f"scene: {kind} name", taken)
 
 
 def axes(value, what: str) -> np.ndarray:
@@ -233,11 +253,15 @@ def store(record, **values) -> None:
         object.__setattr__(record, field, value)
 
 
-def attribute(name: str, check: Callable, doc: str) -> property:
-    """Return a property of a class that stores check(owner, value) when a value is assigned to it."""
+def attribute(name: str, check: Callable | None, doc: str) -> property:
+    """Return a property of a class that stores check(value, "LABEL: name") when a value is assigned to it.
+
+    A method `_check_NAME(value)` of the class or of a subclass takes the place of `check` where that is None.
+    """
 
     def assign(owner, value) -> None:
-        setattr(owner, f"_{name}", check(owner, value))
+        checked = check(value, f"{owner._label()}: {name}") if check else getattr(owner, f"_check_{name}")(value)
+        setattr(owner, f"_{name}", checked)
 
     return property(operator.attrgetter(f"_{name}"), assign, doc=doc)
 

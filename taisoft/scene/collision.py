@@ -7,8 +7,6 @@ drop_everything, the ball (radius 0.2 m) and the edge of a step then penetrate b
 request.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from taisoft.attributes import guarded_record
@@ -22,8 +20,9 @@ CONTACT_MODES = ("auto", "distance_field", "proximity")
 SHARP = 60.0  # [degrees] between adjacent face normals above which a convex edge is sharp
 
 
-@guarded_record("collision settings", "give scene.collision new CollisionSettings({name}=...) before a Simulator takes the scene")
-@dataclass(frozen=True)
+@guarded_record(
+    "collision settings", "give scene.collision new CollisionSettings({name}=...) before a Simulator takes the scene", eq=True
+)
 class CollisionSettings:
     """Settings of contact detection. Raises SceneError for numbers outside the rules below."""
 

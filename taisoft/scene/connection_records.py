@@ -5,33 +5,26 @@ the start.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
 
 from taisoft.attributes import guarded_record
-from taisoft.scene import checks
-from taisoft.scene.loads import ScalarLoad
+from taisoft.scene.loads import Cavity, ScalarLoad
 
 MAX_OUTSIDE = 0.1  # heights of a tet by which a point may lie outside a body: curved surfaces do not meet exactly
 _ADD_ANOTHER = "remove it from its list and add another one before the Simulator is made"
 
 
 @guarded_record("point", _ADD_ANOTHER)
-@dataclass(frozen=True, eq=False)
 class Point:
     """A point of a body or of an obstacle."""
 
     owner: str  #: name of the body or obstacle
     position: np.ndarray  #: (3,) [m], of a body at rest, of an obstacle in the scene
 
-    def __post_init__(self):
-        checks.store(self, position=self.position)
-
 
 @guarded_record("spring", _ADD_ANOTHER)
-@dataclass(frozen=True, eq=False)
 class Spring:
     """A spring between two points, which pulls with stiffness times its extension, plus damping times its rate."""
 
@@ -48,7 +41,6 @@ class Spring:
 
 
 @guarded_record("tendon", "call sim.set_tension(name, force) or sim.set_length(name, length) in a simulation")
-@dataclass(frozen=True, eq=False)
 class Tendon(ScalarLoad):
     """A line through points, along which it slides without friction, of given tension or of given length at rest.
 
@@ -61,12 +53,7 @@ class Tendon(ScalarLoad):
     given: str = "force"  #: "force" or "length": what its value is
     stiffness: float | None = None  #: [N/m] of one of given length; None: inextensible
     damping: ClassVar[float] = 0.0  #: [N s/m]
-    owners = Spring.owners
-
-    @property
-    def kind(self) -> str:
-        """What its value is."""
-        return self.given
+    owners, kind = Spring.owners, Cavity.kind
 
     def allows(self, value: float) -> bool:
         """Whether a tension [N] or a length [m], whichever is given, may have this value."""
@@ -84,7 +71,6 @@ class Tendon(ScalarLoad):
 
 
 @guarded_record("attachment", _ADD_ANOTHER)
-@dataclass(frozen=True, eq=False)
 class Attachment:
     """Nodes of a body, each kept where it lies in a body or obstacle, or pulled there by a spring of rest length 0."""
 
@@ -96,9 +82,6 @@ class Attachment:
     damping: float = 0.0  #: [N s/m] of each node
     where: Callable | None = None  #: as in `Constraint`
     reach: float = MAX_OUTSIDE  #: heights of a tet by which the nodes may lie outside body b
-
-    def __post_init__(self):
-        checks.store(self, nodes=self.nodes)
 
     @property
     def owners(self) -> list[str]:

@@ -14,7 +14,7 @@ from taisoft.errors import SceneError, reworded
 from taisoft.scene import checks
 from taisoft.scene.body import Body, Constraint
 from taisoft.scene.connection_records import MAX_OUTSIDE, Attachment, Point, Spring, Tendon
-from taisoft.scene.loads import value_or_path
+from taisoft.scene.loads import either, value_or_path
 from taisoft.scene.locate import locate
 from taisoft.scene.obstacles import Obstacle
 from taisoft.scene.rigid import RigidBody
@@ -46,9 +46,7 @@ def add_spring(
     if rest_length is not None:
         rest_length = checks.number(rest_length, f"{what}: rest_length", minimum=0.0, unit="m")
     damping = checks.number(damping, f"{what}: damping", minimum=0.0, unit="N s/m")
-    spring = Spring(name, points, stiffness, rest_length, damping)
-    list.append(self.springs, spring)
-    return spring
+    return self._add(self.springs, Spring(name, points, stiffness, rest_length, damping))
 
 
 def add_tendon(
@@ -70,16 +68,14 @@ def add_tendon(
     made = tuple(_point(self, end, f"{what}: point {k}") for k, end in enumerate(points))
     _check_any_body(self, made, what)
     _check_distinct(self, made, what)
-    given = _what_is_given(what, force, length)
+    given, content = either(what, force=force, length=length)
     if stiffness is not None:
         if given == "force":
             raise SceneError(f"{what}: stiffness is that of a tendon of given length: give a length instead of a force")
         stiffness = checks.number(stiffness, f"{what}: stiffness", above=0.0, unit="N/m")
-    load = value_or_path(force if given == "force" else length, what, given, ((),))
-    tendon = Tendon(name, made, **load, given=given, stiffness=stiffness)
+    tendon = Tendon(name, made, given, stiffness, **value_or_path(content, what, given, Tendon.shapes))
     check_tendon(tendon, tendon.path(0.0) if tendon.value is None else tendon.value, what)
-    list.append(self.tendons, tendon)
-    return tendon
+    return self._add(self.tendons, tendon)
 
 
 def attach(
@@ -115,8 +111,7 @@ def attach(
     attachment = Attachment(name, body.name, nodes, owner.name, stiffness, damping, where if callable(where) else None)
     if isinstance(owner, Body):
         locate_nodes(self, attachment)
-    list.append(self.attachments, attachment)
-    return attachment
+    return self._add(self.attachments, attachment)
 
 
 def check_connections(scene: "Scene") -> None:
@@ -239,7 +234,7 @@ def _point(scene: "Scene", end, what: str) -> Point:
         rows = owner.selectable
         node = rows.start + checks.whole(end[1], f"{what}: the node", range(rows.stop - rows.start))
         return Point(owner.name, owner.rest_positions[node].copy())
-    position = checks.array(end[1], f"{what}: the point", ((3,),))
+    position = checks.vector(end[1], f"{what}: the point")
     check_inside(owner, position, f"{what}: the point")
     return Point(owner.name, position)
 
@@ -260,13 +255,6 @@ def _check_distinct(scene: "Scene", points: tuple[Point, ...], what: str) -> Non
     for k, (p, q) in enumerate(zip(points, points[1:])):
         if coincide(scene, p, q):
             raise SceneError(f"{what}: points {k} and {k + 1} coincide")
-
-
-def _what_is_given(what: str, force, length) -> str:
-    """Return which of a tendon's two is given. Raises SceneError if both are or neither is."""
-    if (force is None) == (length is None):
-        raise SceneError(f"{what}: give either a force or a length")
-    return "force" if length is None else "length"
 
 
 def _check_any_body(scene: "Scene", points: tuple[Point, ...], what: str) -> None:

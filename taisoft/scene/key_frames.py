@@ -11,7 +11,6 @@ import numpy as np
 import scipy
 
 from taisoft.attributes import guarded_record
-from taisoft.display import short_repr
 from taisoft.errors import SceneError
 from taisoft.scene import checks
 
@@ -20,7 +19,6 @@ PARALLEL = 1e-12  # sine of the angle between two axes below which they count as
 
 
 @guarded_record("key frames", "make new KeyFrames")
-@dataclass(frozen=True, eq=False)
 class KeyFrames:
     """A path for `Body.move` and `Scene.add_obstacle`. Calling it with t [s] returns (translation (3,) [m], rotation (3,3)).
 
@@ -37,21 +35,15 @@ class KeyFrames:
     release: bool = False  #: prescribed nodes are released at the last time
     values: np.ndarray | None = None  #: (k,) of a load that is one number, in its unit; excludes all but times and smooth
 
-    __repr__ = short_repr
-
     def __post_init__(self):
         what = "key frames"
-        k = max(checks.length(self.times), 1)
-        times = checks.array(self.times, f"{what}: times", ((k,),))
-        descends = np.diff(times) <= 0
-        if descends.any():
-            first = int(np.argmax(descends))
-            raise SceneError(f"{what}: times must ascend, but {times[first + 1]:g} follows {times[first]:g}")
+        times = checks.times(self.times, f"{what}: times")
         if self.values is not None:
             self._check_values(what, times)
             return
         if self.translations is None and self.rotations is None:
             raise SceneError(f"{what}: translations, rotations or values are needed")
+        k = len(times)
         validated = {"times": times, "translations": np.zeros((k, 3))}
         for field, shape in (("translations", (k, 3)), ("rotations", (k, 3)), ("pivot", (3,))):
             if getattr(self, field) is not None:

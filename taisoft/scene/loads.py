@@ -27,18 +27,10 @@ class Load:
     value: np.ndarray | None  #: in one of `shapes`, in the unit of the load; None if it follows a path
     path: Callable | None = None  #: t [s] -> such a value
     path_shape: tuple[int, ...] | None = None  #: of all values along the path
-
-    def __post_init__(self):
-        checks.store(self, **{name: one for name, one in vars(self).items() if isinstance(one, np.ndarray)})
-
-    @property
-    def shapes(self) -> tuple[tuple[int, ...], ...]:
-        """Shapes that its values may have."""
-        return ((3,),)
+    shapes: ClassVar[tuple[tuple[int, ...], ...]] = ((3,),)  #: those that its values may have
 
 
 @guarded_record("traction", "call sim.set_traction(body, index, value) in a simulation")
-@dataclass(frozen=True, eq=False)
 class Traction(Load):
     """A dead load on surface triangles, its value a force per reference area [Pa]."""
 
@@ -47,7 +39,6 @@ class Traction(Load):
 
 
 @guarded_record("force", "call sim.set_force(body, index, value) in a simulation")
-@dataclass(frozen=True, eq=False)
 class NodalForce(Load):
     """A dead load on nodes: a total force (3,) [N] distributed by lumped mass, or one force per node (k,3) [N]."""
 
@@ -57,7 +48,7 @@ class NodalForce(Load):
 
     @property
     def shapes(self) -> tuple[tuple[int, ...], ...]:
-        """Shapes that its values may have."""
+        """A total, or one for each node."""
         return ((3,), (len(self.nodes), 3))
 
 
@@ -66,15 +57,10 @@ class ScalarLoad(Load):
     """A load that is one number."""
 
     kind: ClassVar[str] = "number"
-
-    @property
-    def shapes(self) -> tuple[tuple[int, ...], ...]:
-        """Shapes that its values may have."""
-        return ((),)
+    shapes: ClassVar[tuple[tuple[int, ...], ...]] = ((),)
 
 
 @guarded_record("pressure", "call sim.set_pressure(body, index, value) in a simulation")
-@dataclass(frozen=True, eq=False)
 class Pressure(ScalarLoad):
     """A follower load on surface triangles: its value [Pa] pushes along the deformed inward normal."""
 
@@ -89,7 +75,6 @@ class Pressure(ScalarLoad):
 
 
 @guarded_record("cavity", "call sim.set_cavity(name, value) in a simulation")
-@dataclass(frozen=True, eq=False)
 class Cavity(ScalarLoad):
     """A closed inner surface with a fluid of given pressure [Pa], or an incompressible one of given volume [m^3], its value."""
 
@@ -110,7 +95,6 @@ class Cavity(ScalarLoad):
 
 
 @guarded_record("activation", "call sim.set_activation(body, value) in a simulation")
-@dataclass(frozen=True, eq=False)
 class Activation(ScalarLoad):
     """How active the fibres of a body are, or those of one of its regions: from 0 to 1."""
 
@@ -130,6 +114,14 @@ class LoadPath:
 
     def __call__(self, t: float) -> np.ndarray | float:
         return self.frames(t)[0] if self.frames.values is None else self.frames.value_at(t)
+
+
+def either(what: str, **two) -> tuple:
+    """Return name and value of the one of two arguments that is given. Raises SceneError if both or neither are."""
+    given = [(name, value) for name, value in two.items() if value is not None]
+    if len(given) != 1:
+        raise SceneError(f"{what}: give either a {' or a '.join(two)}")
+    return given[0]
 
 
 def value_or_path(load, what: str, kind: str, shapes: tuple[tuple[int, ...], ...]) -> dict:

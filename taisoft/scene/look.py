@@ -1,13 +1,11 @@
 """How a scene looks, which changes nothing in a simulation: colours, opacity, lights, and the camera."""
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 import scipy
 
 from taisoft.attributes import guarded_record
-from taisoft.display import short_repr
 from taisoft.errors import SceneError, value_text
 from taisoft.mesh.placing import FROM_Y_UP, UP
 from taisoft.scene import checks
@@ -68,15 +66,12 @@ def check_follow(camera: "Camera | None", bodies) -> "Camera | None":
 
 
 @guarded_record("light", "make a new Light")
-@dataclass(frozen=True, eq=False)
 class Light:
     """Light from far away, of a scene's `lights`. Raises SceneError."""
 
     direction: np.ndarray  #: (3,) in which it shines, of any length
     strength: float = 0.7  #: fraction of its colour that a face perpendicular to it shows
     colour: np.ndarray | str = (1.0, 1.0, 1.0)  #: sRGB, (3,) in [0, 1] or "#rrggbb"
-
-    __repr__ = short_repr
 
     def __post_init__(self):
         direction = checks.array(self.direction, "light: direction", ((3,),))
@@ -86,7 +81,6 @@ class Light:
 
 
 @guarded_record("camera", "make a new Camera")
-@dataclass(frozen=True, eq=False)
 class Camera:
     """From where pictures and films show a scene: `scene.camera`. With times, positions, targets and fields of view are key
     frames, between which the camera turns about its target on a smooth curve. Raises SceneError.
@@ -99,22 +93,14 @@ class Camera:
     times: np.ndarray | None = None  #: (k,) ascending [s]; before the first and after the last the camera stays
     follow: str | None = None  #: name of a body with whose mean displacement the camera moves along
 
-    __repr__ = short_repr
-
     def __post_init__(self):
-        times = None
-        if self.times is not None:
-            times = checks.array(self.times, "camera: times", ((max(checks.length(self.times), 1),),))
-            if (np.diff(times) <= 0.0).any():
-                raise SceneError("camera: times must ascend")
-        elif any(np.ndim(getattr(self, name)) > least for name, least in (("position", 1), ("target", 1), ("fov", 0))):
+        varying = (("position", 1), ("target", 1), ("fov", 0))
+        if self.times is None and any(np.ndim(getattr(self, name)) > least for name, least in varying):
             raise SceneError("camera: key frames of position, target or fov need times [s]")
+        times = None if self.times is None else checks.times(self.times, "camera: times")
         k = () if times is None else (len(times),)
-        values = {"position": ((3,), (*k, 3)), "target": ((3,), (*k, 3)), "fov": ((), k)}
-        values = {
-            name: checks.array(getattr(self, name), f"camera: {name}", (*dict.fromkeys(shapes),))
-            for name, shapes in values.items()
-        }
+        shapes = {"position": ((3,), (*k, 3)), "target": ((3,), (*k, 3)), "fov": ((), k)}
+        values = {name: checks.array(getattr(self, name), f"camera: {name}", ones) for name, ones in shapes.items()}
         if ((values["fov"] < 1.0) | (values["fov"] > 120.0)).any():
             raise SceneError(f"camera: fov must be from 1 to 120 degrees, not {value_text(self.fov)}")
         offsets = np.atleast_2d(values["position"] - values["target"])

@@ -3,7 +3,6 @@
 import dataclasses
 import functools
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -53,9 +52,10 @@ def _with_moduli(law: Law, named: dict, own: dict) -> dict:
     return {**named, "parameters": parameters, **dict(zip(MODULI, law.moduli(parameters)))}
 
 
-@guarded_record("material", "make another one by dataclasses.replace, or call sim.set_material(body, {name}=...) in a simulation")
 @_takes_parameters
-@dataclass(frozen=True)
+@guarded_record(
+    "material", "make another one by dataclasses.replace, or call sim.set_material(body, {name}=...) in a simulation", eq=True
+)
 class Material:
     """An elastic material with damping and surface parameters. Raises SceneError for values outside the rules below."""
 

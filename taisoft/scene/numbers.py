@@ -12,6 +12,7 @@ from taisoft.attributes import thawed
 from taisoft.errors import SceneError
 from taisoft.scene import checks
 from taisoft.scene.body import Body
+from taisoft.scene.body_loads import activate_fibres
 from taisoft.scene.laws import LAWS
 from taisoft.scene.loads import LOADS
 from taisoft.scene.material import FIBRE_NUMBERS, MODULI, Material
@@ -115,7 +116,7 @@ def _of_fibres(body: Body) -> Iterator[Entry]:
             yield f"{owner}.{name}", value, partial(_set_material, body, name, region)
         values = {None if one.value is None else float(one.value) for one in body.activations if region in (None, one.region)}
         value = values.pop() if len(values) == 1 else None
-        yield f"{owner}.activation", value, partial(body._activate, region=region, what=f"body {body.name!r}: activate")
+        yield f"{owner}.activation", value, partial(activate_fibres, body, region=region, what=f"body {body.name!r}: activate")
 
 
 def _of_rigid(body: RigidBody) -> Iterator[Entry]:

@@ -12,7 +12,6 @@ from typing import ClassVar
 import numpy as np
 
 from taisoft.attributes import guarded_record
-from taisoft.display import short_repr
 from taisoft.errors import MeshError, SceneError, reason, reworded, value_text
 from taisoft.mesh.shapes import box_mesh
 from taisoft.mesh.surface_mesh import SurfaceMesh
@@ -53,13 +52,12 @@ class Shape:
 
     def _check(self, *vectors: str) -> None:
         """Validate these (3,) fields, and the radius if there is one."""
-        checks.store(self, **{field: checks.array(getattr(self, field), f"{self.word}: {field}", ((3,),)) for field in vectors})
+        checks.store(self, **{field: checks.vector(getattr(self, field), f"{self.word}: {field}") for field in vectors})
         if hasattr(self, "radius"):
             checks.store(self, radius=checks.number(self.radius, f"{self.word}: radius", above=0.0, unit="m"))
 
 
 @guarded_record("half-space", MAKE_ANOTHER)
-@dataclass(frozen=True, eq=False)
 class HalfSpace(Shape):
     """All points x with (x - point) . normal <= 0. Raises SceneError for a normal without length."""
 
@@ -83,7 +81,6 @@ class HalfSpace(Shape):
 
 
 @guarded_record("sphere", MAKE_ANOTHER)
-@dataclass(frozen=True, eq=False)
 class Sphere(Shape):
     """A solid sphere. Raises SceneError unless its radius is above 0."""
 
@@ -101,7 +98,6 @@ class Sphere(Shape):
 
 
 @guarded_record("box", MAKE_ANOTHER)
-@dataclass(frozen=True, eq=False)
 class Box(Shape):
     """An axis-aligned box. Raises SceneError unless its half extents are above 0."""
 
@@ -126,7 +122,6 @@ class Box(Shape):
 
 
 @guarded_record("capsule", MAKE_ANOTHER)
-@dataclass(frozen=True, eq=False)
 class Capsule(Shape):
     """All points within a radius of the segment from a to b. Raises SceneError unless the radius is above 0 and a is not b."""
 
@@ -155,7 +150,6 @@ class Capsule(Shape):
 
 
 @guarded_record("mesh obstacle", MAKE_ANOTHER)
-@dataclass(frozen=True, eq=False)
 class MeshObstacle(Shape):
     """Triangles whose normals point out of the solid; they may be open, and inward normals bound a cavity.
 
@@ -167,12 +161,11 @@ class MeshObstacle(Shape):
     triangles: np.ndarray  #: (t,3) int64
     kind: ClassVar[int] = 4
     word: ClassVar[str] = "mesh obstacle"
-    __repr__ = short_repr
 
     def __post_init__(self):
-        vertices = checks.array(self.vertices, "mesh obstacle: vertices", ((max(checks.length(self.vertices), 3), 3),))
         with reworded(MeshError, "mesh obstacle: ", raised=SceneError, without="mesh obstacle: "):
-            triangles = SurfaceMesh(vertices, self.triangles, "mesh obstacle").triangles
+            surface = SurfaceMesh(self.vertices, self.triangles, "mesh obstacle")
+            vertices, triangles = surface.vertices, surface.triangles
             flat = np.flatnonzero(~(normals_and_heights(vertices, triangles)[1] > DEGENERATE))
             if len(flat):
                 raise SceneError(
@@ -219,7 +212,6 @@ def surface_numbers(friction, restitution, what: str) -> tuple[float, float]:
 @guarded_record(
     "obstacle", "scene.set_contact sets friction and restitution of a pair, sim.set_contact in a simulation, and a path moves it"
 )
-@dataclass(frozen=True, eq=False)
 class Obstacle:
     """A shape in a scene; made by `Scene.add_obstacle`.
 
@@ -286,7 +278,7 @@ def checked_pose(value, t: float, what: str) -> tuple[np.ndarray, np.ndarray]:
         translation, rotation = value
     except Exception as error:
         raise SceneError(f"{what} must give (translation, rotation) and failed at t = {t:g}: {reason(error)}") from error
-    translation = checks.array(translation, f"{what}'s translation at t = {t:g}", ((3,),))
+    translation = checks.vector(translation, f"{what}'s translation at t = {t:g}")
     rotation = checks.array(rotation, f"{what}'s rotation at t = {t:g}", ((3, 3),))
     with np.errstate(over="ignore", invalid="ignore"):
         rigid = np.abs(rotation.T @ rotation - np.eye(3)).max() <= RIGID_TOLERANCE and np.linalg.det(rotation) > 0

@@ -9,7 +9,8 @@ from dataclasses import dataclass, field, replace
 from taisoft.attributes import thawed
 from taisoft.errors import SceneError
 from taisoft.scene import checks
-from taisoft.scene.body import NEARLY_INCOMPRESSIBLE, Body, check_volume
+from taisoft.scene.body import NEARLY_INCOMPRESSIBLE, Body
+from taisoft.scene.body_loads import check_volume
 from taisoft.scene.collision import has_sharp_edges
 from taisoft.scene.connections import check_tendon
 from taisoft.scene.laws import LAWS

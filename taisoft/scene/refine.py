@@ -38,10 +38,8 @@ def refined(scene: Scene) -> Scene:
 
 def with_order(scene: Scene, order: int) -> Scene:
     """Return the scene with all bodies of order 1 or 2. Raises SceneError as `refined` does."""
-    made = []
-    for body in scene.bodies:
-        made.append(_same(body) if isinstance(body, RigidBody) or body.order == order else _of_order(body, order))
-    return _with_bodies(scene, made)
+    kept = [isinstance(body, RigidBody) or body.order == order for body in scene.bodies]
+    return _with_bodies(scene, [_same(body) if keep else _of_order(body, order) for body, keep in zip(scene.bodies, kept)])
 
 
 def _same(body: Body) -> tuple[Body, np.ndarray]:
@@ -106,10 +104,8 @@ def _of_order(old: Body, order: int) -> tuple[Body, np.ndarray]:
 
 def _add_surface_loads(new: Body, old: Body, chosen: Callable[[np.ndarray], np.ndarray]) -> None:
     """Add the loads on triangles of the old body. chosen: old triangles -> what chooses the new ones."""
-    for load in old.tractions:
-        new.add_traction(chosen(load.triangles), _load_of(load))
-    for load in old.pressures:
-        new.add_pressure(chosen(load.triangles), _load_of(load))
+    for load in (*old.tractions, *old.pressures):
+        getattr(new, f"add_{load.kind}")(chosen(load.triangles), _load_of(load))
     for cavity in old.cavities:
         new.add_cavity(chosen(cavity.triangles), name=cavity.name, **{cavity.given: _load_of(cavity)})
 
@@ -130,8 +126,7 @@ def _on_mesh(old: Body, mesh: TetMesh, order: int, parents: np.ndarray) -> Body:
     new = Body(old.name, mesh, old.material, old.position, velocity, order, degree, *kept, **numbers)
     with thawed(new):
         new.activations = old.activations
-    if order == old.order:  # as decided, whatever numbers have changed since
-        with thawed(new):
+        if order == old.order:  # as decided, whatever numbers have changed since
             new.dilatation = old.dilatation
     if old.skin is not None:
         new.embed(old.skin.surface, old.skin.contact)

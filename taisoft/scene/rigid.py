@@ -91,7 +91,7 @@ class RigidBody(Body):
         with thawed(self):
             self.nodes = mesh_nodes.embed(self.nodes, self.surface.vertices, self.surface.triangles, weights)
         given = {"velocity": velocity, "angular_velocity": angular_velocity}
-        linear, spin = (checks.array(value, f"{what}: {key}", ((3,),)) for key, value in given.items())
+        linear, spin = (checks.vector(value, f"{what}: {key}") for key, value in given.items())
         self._given_twist = Twist(linear, spin)
         self.velocity = self._velocities(linear, spin) if spin.any() else linear
         self._seal(RigidBody.__init__)
@@ -105,7 +105,7 @@ class RigidBody(Body):
             raise SceneError(f"{self._label()}: velocity can only be set to (3,), without spin: else {ADD_ANOTHER}")
         return velocity
 
-    velocity = checks.attribute("velocity", _check_velocity, "Initial velocity [m/s]: (3,) without spin, else (n,3).")
+    velocity = checks.attribute("velocity", None, "Initial velocity [m/s]: (3,) without spin, else (n,3).")
 
     def _velocities(self, linear: np.ndarray, angular: np.ndarray) -> np.ndarray:
         return linear + np.cross(angular, self.rest_positions - self.centre)
@@ -208,8 +208,7 @@ class RigidBody(Body):
         axes: the directions, such as "y" or "xz", that no point of it moves along; rotations: the axes that it then cannot turn
         about, which are all that would move a point along `axes`; None for just these. Raises SceneError for other rotations.
         """
-        self._check_open("fix")
-        what = f"{self._label()}: fix"
+        what = self._check_open("fix")
         mask = checks.axes(axes, what)
         held = "".join(axis for k, axis in enumerate("xyz") if np.delete(mask, k).any())
         if rotations is not None and (not isinstance(rotations, str) or sorted(rotations) != list(held)):

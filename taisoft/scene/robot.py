@@ -40,7 +40,6 @@ def import_mujoco() -> Any:
 
 
 @guarded_record("robot", "load it again, with other arguments")
-@dataclass(frozen=True, eq=False)
 class Robot:
     """A robot as MuJoCo compiled it; made by `Robot.load`. Several scenes, and one scene several times, may hold it."""
 
@@ -256,6 +255,5 @@ def add_robot(
     if not made:
         raise SceneError(f"{what}: {robot.path} has no shape that collides" + ("" if links is None else " in these links"))
     for obstacle in made:
-        list.append(self.obstacles, obstacle)
-    list.append(self.robots, placed)
-    return placed
+        self._add(self.obstacles, obstacle)
+    return self._add(self.robots, placed)

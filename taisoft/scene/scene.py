@@ -4,9 +4,9 @@ Every input is validated and converted to arrays when it is added, so an existin
 """
 
 import copy
-import difflib
 import math
 from collections.abc import Callable, Mapping
+from functools import partial
 
 import numpy as np
 
@@ -64,7 +64,7 @@ class Scene(Guarded):
     def __init__(self, gravity=None, up: str | None = None):
         """gravity: (3,) [m/s^2], by default 9.81 downwards. up: axis that points up, "y" or "z"; by default "z" if gravity acts
         exactly along -z, else "y". Raises SceneError for other values."""
-        x, y, z = self._check_gravity((0.0, 0.0, 0.0) if gravity is None else gravity)
+        x, y, z = np.zeros(3) if gravity is None else checks.vector(gravity, "scene: gravity")
         self.up = up if up is not None else "z" if x == y == 0.0 > z else "y"
         self.gravity = 0.0 - 9.81 * UP[self.up] if gravity is None else gravity
         self.bodies: list[Body] = []
@@ -80,49 +80,37 @@ class Scene(Guarded):
         self._start: Scene | None = None  # see `snapshot`
         self._seal(Scene.__init__)
 
-    def _check_gravity(self, value) -> np.ndarray:
-        return checks.array(value, "scene: gravity", ((3,),))
-
-    def _check_collision(self, value) -> CollisionSettings:
-        if not isinstance(value, CollisionSettings):
-            raise SceneError(f"scene: collision must be CollisionSettings, not {type(value).__name__}")
-        return value
-
-    def _check_camera(self, value) -> Camera | None:
-        if value is not None and not isinstance(value, Camera):
-            raise SceneError(f"scene: camera must be a Camera or None, not {type(value).__name__}")
-        return value
-
-    gravity = checks.attribute("gravity", _check_gravity, "Acceleration of gravity (3,) [m/s^2].")
+    gravity = checks.attribute("gravity", checks.vector, "Acceleration of gravity (3,) [m/s^2].")
     up = checks.attribute(
         "up",
-        lambda _, value: checks.choice(value, "scene: up", tuple(UP)),
+        partial(checks.choice, allowed=tuple(UP)),
         'Axis that points up, "y" or "z", in pictures, in USD and for `add_ground`; setting it turns nothing in the scene.',
     )
-    collision = checks.attribute("collision", _check_collision, "Settings of the contact search.")
+    collision = checks.attribute("collision", partial(checks.instance, kind=CollisionSettings), "Settings of the contact search.")
     allow_initial_overlap = checks.attribute(
         "allow_initial_overlap",
-        lambda _, value: checks.flag(value, "scene: allow_initial_overlap"),
+        checks.flag,
         "Whether initial overlap is allowed. Otherwise a Simulator refuses overlaps deeper than 1e-6 of the smaller size.",
     )
     contact_forces = checks.attribute(
         "contact_forces",
-        lambda _, value: checks.flag(value, "scene: contact_forces"),
+        checks.flag,
         "Whether contacts exert forces. Otherwise bodies pass through each other, and contacts are detected only on request.",
     )
-
     background = checks.attribute(
         "background",
-        lambda _, value: background_of(value),
+        lambda value, _: background_of(value),
         'sRGB colours (2,3) at the top and the bottom of pictures, also set as one for both, or as "#rrggbb"; None: light grey.',
     )
     lights = checks.attribute(
         "lights",
-        lambda _, value: lights_of(value),
+        lambda value, _: lights_of(value),
         "Lights of pictures and USD, a tuple of `Light`, beside that of the sky; None: two that move with the camera.",
     )
     camera = checks.attribute(
-        "camera", _check_camera, "`Camera` of pictures, films and USD; None: one that frames the bodies and steps back from them."
+        "camera",
+        partial(checks.instance, kind=Camera, optional=True),
+        "`Camera` of pictures, films and USD; None: one that frames the bodies and steps back from them.",
     )
 
     def pushes(self, self_collision: bool) -> bool:
@@ -175,7 +163,7 @@ class Scene(Guarded):
 
     def check(self) -> None:
         """Raise SceneError if in-place changes made an array, such as gravity, invalid."""
-        self._check_gravity(self.gravity)
+        checks.vector(self.gravity, "scene: gravity")
         for body in self.bodies:
             body.check()
         names: set[str] = set()
@@ -284,7 +272,7 @@ class Scene(Guarded):
         shape = order, quadrature_degree, collision, dilatation, fibres, curve
         body = Body(name, mesh, material, position, velocity, *shape, **numbers)
         body.colour, body.opacity = colour, opacity
-        list.append(self.bodies, body)
+        self._add(self.bodies, body)
         body.warn_locking(stacklevel=2)
         body.warn_bending(stacklevel=2)
         return body
@@ -315,8 +303,7 @@ class Scene(Guarded):
         name = self._free_name(name, "rigid")
         body = RigidBody(name, mesh, density, position, velocity, angular_velocity, friction, restitution, young)
         body.colour, body.opacity = colour, opacity
-        list.append(self.bodies, body)
-        return body
+        return self._add(self.bodies, body)
 
     def add_obstacle(
         self,
@@ -335,9 +322,8 @@ class Scene(Guarded):
         or `KeyFrames`. colour, opacity: as for `add_body`. Raises SceneError.
         """
         self._check_open("add_obstacle")
-        obstacle = Obstacle(shape, self._free_name(name, "obstacle"), friction, restitution, path, colour, opacity)
-        list.append(self.obstacles, obstacle)
-        return obstacle
+        name = self._free_name(name, "obstacle")
+        return self._add(self.obstacles, Obstacle(shape, name, friction, restitution, path, colour, opacity))
 
     def add_ground(
         self,
@@ -358,10 +344,8 @@ class Scene(Guarded):
 
     def cavity(self, name: str) -> tuple[Body, Cavity]:
         """Return the cavity with this name, and its body. Raises SceneError if there is none."""
-        owners = [body for body in self.bodies for _ in body.cavities]
-        cavities = [cavity for body in self.bodies for cavity in body.cavities]
-        found = _find(cavities, name, "cavity")
-        return owners[cavities.index(found)], found
+        owned = [(body, cavity) for body in self.bodies for cavity in body.cavities]
+        return owned[checks.index(name, [cavity.name for _, cavity in owned], "scene: no cavity")]
 
     def obstacle(self, name: str) -> Obstacle:
         """Return the obstacle with this name. Raises SceneError if there is none."""
@@ -420,12 +404,6 @@ class Scene(Guarded):
         return checks.free_name(name, kind, [one.name for one in self.colliders])
 
 
-def _find(items: list, name: str, kind: str) -> Body | Obstacle | Cavity:
+def _find(items: list, name: str, kind: str) -> Body | Obstacle:
     """Return the item with this name. Raises SceneError with the closest name if there is none."""
-    for item in items:
-        if isinstance(name, str) and item.name == name:
-            return item
-    names = [item.name for item in items]
-    near = difflib.get_close_matches(name, names, n=1) if isinstance(name, str) else []
-    hint = f"; did you mean {near[0]!r}?" if near else f"; there are {names}" if names else "; the scene has none"
-    raise SceneError(f"scene: no {kind} is called {name!r}{hint}")
+    return items[checks.index(name, [item.name for item in items], f"scene: no {kind}")]

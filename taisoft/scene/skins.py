@@ -3,7 +3,6 @@
 Each vertex moves as the point of the body's elements at which it lies at rest. `embed` is a method of `Body`.
 """
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -23,7 +22,6 @@ MAX_OUTSIDE = 0.5  # heights of the nearest tet by which a vertex may lie outsid
 
 
 @guarded_record("skin", "add another body")
-@dataclass(frozen=True, eq=False)
 class Skin:
     """A surface that rides in the tets of a body."""
 
@@ -40,8 +38,7 @@ def embed(self: "Body", surface: SurfaceMesh, contact: bool = False, colour=None
     touched; it must then be closed, and its vertices follow the nodes of the tets in all results. colour, opacity: set those of
     the body. Raises SceneError.
     """
-    self._check_open("embed")
-    what = f"{self._label()}: embed"
+    what = self._check_open("embed")
     surface = as_surface(surface)
     if not isinstance(surface, SurfaceMesh):
         raise SceneError(f"{what}: surface must be a SurfaceMesh (see ts.read_surface), not {type(surface).__name__}")

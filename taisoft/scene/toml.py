@@ -37,8 +37,6 @@ import warnings
 from collections.abc import Callable
 from pathlib import Path
 
-import numpy as np
-
 from taisoft.errors import SceneError
 from taisoft.files import as_path
 from taisoft.mesh.safe_reading import UTF16, utf16_head
@@ -54,39 +52,19 @@ from taisoft.scene.material import Material
 from taisoft.scene.obstacles import Box, Capsule, HalfSpace, MeshObstacle, Sphere
 from taisoft.scene.scene import Scene
 from taisoft.scene.tables import Table, arguments_of, check_values, value_text
-from taisoft.scene.toml_connections import add_connections
+from taisoft.scene.toml_connections import CONNECTIONS, add_connections
 from taisoft.scene.toml_look import LOOK_KEYS, read_look
-from taisoft.scene.toml_meshes import kind_of, mesh_of, surface_of
-from taisoft.scene.toml_methods import call_methods
-from taisoft.scene.toml_rigid import add_rigid_body
+from taisoft.scene.toml_meshes import kind_of, mesh_of, solid_of, surface_of
+from taisoft.scene.toml_methods import METHODS, OF_RIGID, call_methods
 
 SHAPES = {"half_space": HalfSpace, "sphere": Sphere, "box": Box, "capsule": Capsule, "mesh": MeshObstacle}
-METHODS = {
-    "fix": Body.fix,
-    "move": Body.move,
-    "traction": Body.add_traction,
-    "force": Body.add_force,
-    "pressure": Body.add_pressure,
-    "cavity": Body.add_cavity,
-    "activate": Body.activate,
-}
 GROUND = "ground"  # a shape as well: a half-space whose normal is up
-ON_TRIANGLES = ("traction", "pressure", "cavity")  # methods that choose surface triangles, not nodes
 SCENE_KEYS = ("up", "gravity", "allow_initial_overlap", "contact_forces")  # attributes of a Scene at top level
 TOP_KEYS = [
     *SCENE_KEYS,
     *LOOK_KEYS,
-    "body_order",
-    "collision",
-    "solver",
-    "materials",
-    "bodies",
-    "rigid_bodies",
-    "obstacles",
-    "contacts",
-    "springs",
-    "tendons",
-    "attachments",
+    *("body_order", "collision", "solver", "materials", "bodies", "rigid_bodies", "obstacles", "contacts"),
+    *CONNECTIONS,
 ]
 SURFACE_KEYS = ("friction", "restitution")
 OBSTACLE_KEYS = [*SURFACE_KEYS, "colour", "opacity"]
@@ -145,7 +123,7 @@ def _read(tables: Table, allow_outside: bool) -> tuple[Scene, dict]:
             surface = surface_of(skin, "surface", allow_outside)
             skin.make(body.embed, f"body {name!r}: embed: ", keys=["contact"], surface=surface)
     for name in rigid.known:
-        add_rigid_body(scene, name, rigid, selection, shared)
+        _add_rigid_body(scene, name, rigid, shared)
     if "body_order" in tables:
         order = tables.values["body_order"]
         if not isinstance(order, list) or sorted(map(str, order)) != sorted([*bodies.known, *rigid.known]):
@@ -156,7 +134,7 @@ def _read(tables: Table, allow_outside: bool) -> tuple[Scene, dict]:
         _add_obstacle(scene, name, obstacles)
     read_look(scene, tables)
     _set_contacts(scene, tables)
-    add_connections(scene, tables, selection)
+    add_connections(scene, tables)
     return scene, solver
 
 
@@ -199,8 +177,16 @@ def _add_body(scene: Scene, name: str, table: Table, materials: dict[str, Materi
     keys, _ = arguments_of(Scene.add_body, "name", "mesh", "material", "curve")
     made = {"mesh": mesh, "material": material, "name": name, "curve": curve}
     body = table.make(scene.add_body, f"body {name!r}: ", "scene: ", keys=keys, **made)
-    call_methods(body, table, f"body {name!r}", METHODS, lambda key: "triangles" if key in ON_TRIANGLES else "nodes", selection)
+    call_methods(body, table)
     return body
+
+
+def _add_rigid_body(scene: Scene, name: str, bodies: Table, shared: Callable) -> None:
+    """Add the rigid body in a table of `bodies`. shared: (table, what makes it) -> its mesh."""
+    known, _ = arguments_of(Scene.add_rigid_body, "name", "mesh")
+    table = bodies.table(name, [*known, "mesh", *OF_RIGID], ["mesh"])
+    mesh = shared(table, solid_of)
+    call_methods(table.make(scene.add_rigid_body, f"rigid body {name!r}: ", "scene: ", keys=known, mesh=mesh, name=name), table)
 
 
 def _curve(table: Table, allow_outside: bool) -> Curve | None:
@@ -245,30 +231,6 @@ def _region(mesh: TetMesh, key: str) -> str | int:
     """Return the name of a region, or its id if the text is no name but a whole number as `write_scene` writes it."""
     is_id = key not in mesh.region_names.values() and re.fullmatch(r"0|-?[1-9][0-9]{0,9}", key)
     return int(key) if is_id else key
-
-
-def selection(table: Table, key: str):
-    """Return ids, or a function of points (n,3) that returns a bool mask (n,) and also works on another mesh."""
-    value = table.values[key]
-    if value == "all":
-        return lambda X: np.ones(len(X), dtype=bool)
-    if isinstance(value, list):
-        if not all(isinstance(entry, int) and not isinstance(entry, bool) for entry in value):
-            raise table.error(key, "must be a list of whole numbers, the ids")
-        return value
-    if not isinstance(value, dict) or len(value) != 1:
-        raise table.error(key, f'must be "all", a list of ids, or a table with one of box, half_space, not {value_text(value)}')
-    choice = table.table(key, ["box", "half_space"])
-    if "box" in choice:
-        box = choice.table("box", ["min", "max"], ["min", "max"])
-        corners = {end: box.checked(end) for end in ("min", "max")}
-        with box.located_errors():
-            low, high = (checks.array(value, end, ((3,),)) for end, value in corners.items())
-        if not (low <= high).all():
-            raise box.error("min", "must not exceed max")
-        return lambda X: ((X >= low) & (X <= high)).all(axis=1)
-    half = choice.made("half_space", HalfSpace, "half-space: ")
-    return lambda X: (X - half.point) @ half.normal <= 0.0
 
 
 def _add_obstacle(scene: Scene, name: str, obstacles: Table) -> None:

@@ -1,19 +1,20 @@
 """Read and write the springs, tendons and attachments of a scene file."""
 
-from collections.abc import Callable
-
 from taisoft.errors import SceneError
 from taisoft.scene.connection_records import Point
 from taisoft.scene.key_frames import KeyFrames
-from taisoft.scene.loads import LoadPath
 from taisoft.scene.scene import Scene
 from taisoft.scene.tables import Table, arguments_of, key_path
+from taisoft.scene.toml_methods import selection
+from taisoft.scene.toml_values import load_value, nodes_of
+
+CONNECTIONS = {"springs": "add_spring", "tendons": "add_tendon", "attachments": "attach"}  # key at top level -> method
 
 
-def add_connections(scene: Scene, tables: Table, selection: Callable) -> None:
-    """Add the connections in the tables of a file. selection: (table, key) -> what chooses nodes. Raises SceneError."""
-    for kind, method in (("springs", scene.add_spring), ("tendons", scene.add_tendon), ("attachments", scene.attach)):
-        parent, item = tables.named(kind), kind[:-1]
+def add_connections(scene: Scene, tables: Table) -> None:
+    """Add the connections in the tables of a file. Raises SceneError."""
+    for kind, call in CONNECTIONS.items():
+        parent, item, method = tables.named(kind), kind[:-1], getattr(scene, call)
         known, required = arguments_of(method, "name")
         known, required = (["nodes" if key == "where" else key for key in keys] for keys in (known, required))
         for name in parent.known:
@@ -43,27 +44,21 @@ def _point(table: Table, key: str, value, entry: str = "") -> tuple:
     return value[0], value[1]
 
 
-def connection_tables(scene: Scene, ids: Callable, fields: Callable) -> dict:
-    """Return the tables of a scene's connections. ids: (nodes, n) and fields: record, as the file's writer stores them.
-
-    Raises SceneError for a tendon along a function.
-    """
+def connection_tables(scene: Scene) -> dict:
+    """Return the tables of a scene's connections. Raises SceneError for a tendon along a function."""
     springs, tendons, attachments = {}, {}, {}
     for one in scene.springs:
         springs[one.name] = dict(zip("ab", map(_pair, one.points))) | {"stiffness": one.stiffness, "damping": one.damping}
         if one.rest_length is not None:
             springs[one.name]["rest_length"] = one.rest_length
     for one in scene.tendons:
-        if one.path is not None and not isinstance(one.path, LoadPath):
-            raise SceneError(f"tendon {one.name!r}: its {one.given} is a function, which a file cannot store: use ts.KeyFrames")
-        given = {one.given: float(one.value) if one.path is None else fields(one.path.frames)}
+        given = {one.given: load_value(one, f"tendon {one.name!r}")}
         stiffness = {} if one.stiffness is None else {"stiffness": one.stiffness}
         tendons[one.name] = {"points": [_pair(point) for point in one.points]} | given | stiffness
     for one in scene.attachments:
-        rows = scene.body(one.a).selectable
-        nodes = ids(one.nodes - rows.start, rows.stop - rows.start)
+        nodes = nodes_of(scene.body(one.a), one.nodes)
         springs_of = {} if one.stiffness is None else {"stiffness": one.stiffness, "damping": one.damping}
-        attachments[one.name] = {"a": one.a, "nodes": nodes, "b": one.b} | springs_of
+        attachments[one.name] = {"a": one.a, **nodes, "b": one.b} | springs_of
     return {"springs": springs, "tendons": tendons, "attachments": attachments}
 
 

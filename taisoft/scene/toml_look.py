@@ -1,12 +1,11 @@
 """Read and write the looks of a scene file: background, lights and camera, and colours and opacities."""
 
-from collections.abc import Callable
-
 import numpy as np
 
 from taisoft.scene.look import Camera, Light, check_follow, colour_of
 from taisoft.scene.scene import Scene
 from taisoft.scene.tables import Table, arguments_of
+from taisoft.scene.toml_values import fields_of
 
 LOOK_KEYS = ("background", "lights", "camera")
 
@@ -26,16 +25,16 @@ def read_look(scene: Scene, tables: Table) -> None:
             check_follow(scene.camera, scene.bodies)
 
 
-def look_tables(scene: Scene, fields: Callable) -> dict:
-    """Return the entries of a scene's looks that are set. fields: of a record, as the file's writer stores them."""
+def look_tables(scene: Scene) -> dict:
+    """Return the entries of a scene's looks that are set."""
     tables: dict = {}
     if scene.background is not None:
         two = [colour_value(colour) for colour in scene.background]
         tables["background"] = two[0] if np.array_equal(*scene.background) else two
     if scene.lights is not None:
-        tables["lights"] = [fields(one) | {"colour": colour_value(one.colour)} for one in scene.lights] or ()
+        tables["lights"] = [fields_of(one) | {"colour": colour_value(one.colour)} for one in scene.lights] or ()
     if scene.camera is not None:
-        tables["camera"] = fields(scene.camera)
+        tables["camera"] = fields_of(scene.camera)
     return tables
 
 

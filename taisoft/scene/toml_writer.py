@@ -5,7 +5,6 @@ arguments, any other mesh as a Gmsh file beside the scene file. Paths must be Ke
 can rotating key frames that were bound to other nodes or another obstacle, whose pivot they keep.
 """
 
-import dataclasses
 import warnings
 from numbers import Real
 from pathlib import Path
@@ -15,6 +14,7 @@ import numpy as np
 from taisoft.errors import OutputError, SceneError, reworded
 from taisoft.files import write_bytes
 from taisoft.mesh.files import write_mesh
+from taisoft.mesh.surface_mesh import SurfaceMesh
 from taisoft.mesh.tet_mesh import TetMesh
 from taisoft.scene import checks
 from taisoft.scene.body import QUADRATURE_DEGREES, Body
@@ -22,19 +22,17 @@ from taisoft.scene.checks import SOLVER_CHECKS, check_solver
 from taisoft.scene.fibres import directions
 from taisoft.scene.key_frames import ShapePath
 from taisoft.scene.laws import SHIPPED
-from taisoft.scene.loads import Cavity, Load, LoadPath, NodalForce
+from taisoft.scene.loads import Cavity, NodalForce
 from taisoft.scene.material import MODULI, Material
 from taisoft.scene.obstacles import Obstacle
 from taisoft.scene.rigid import RigidBody
 from taisoft.scene.scene import Scene
-from taisoft.scene.tables import key_path, key_text, quote
 from taisoft.scene.toml import NONE_TEXT, SCENE_KEYS, SHAPES, SURFACE_KEYS
 from taisoft.scene.toml_connections import connection_tables
 from taisoft.scene.toml_look import look_of, look_tables
 from taisoft.scene.toml_methods import constraint_tables
-from taisoft.scene.toml_rigid import rigid_table, surface_table
+from taisoft.scene.toml_values import fields_of, frames_of, ids_of, load_value, nodes_of, toml_of
 
-MAX_LINE = 100  # maximum number of characters of numbers in a line
 FOREIGN_PATH = "rotates along a path made for {}, which a file cannot store: pass the ts.KeyFrames themselves"
 
 
@@ -108,19 +106,16 @@ def _document(scene: Scene, solver: dict, stem: str, meshes: dict[str, TetMesh])
     read = [body.name for body in (*elastic, *scene.rigid_bodies)]  # in the order in which `read_scene` adds them
     return {
         **{key: getattr(scene, key) for key in SCENE_KEYS},
-        **look_tables(scene, _fields),
+        **look_tables(scene),
         **({"body_order": order[: len(read)]} if read != order[: len(read)] else {}),
-        "collision": _fields(scene.collision),
+        "collision": fields_of(scene.collision),
         "solver": _solver(solver),
         "materials": {name: _material(material) for material, name in materials.items()},
         "bodies": {body.name: _body(body, materials, stem, meshes) for body in elastic},
-        "rigid_bodies": {
-            body.name: rigid_table(body, lambda mesh: _mesh_table(mesh, stem, meshes), _fields, _load)
-            for body in scene.rigid_bodies
-        },
+        "rigid_bodies": {body.name: _rigid_body(body, stem, meshes) for body in scene.rigid_bodies},
         "obstacles": {obstacle.name: _obstacle(obstacle) for obstacle in scene.obstacles},
         "contacts": contacts,
-        **connection_tables(scene, _ids, _fields),
+        **connection_tables(scene),
     }
 
 
@@ -139,8 +134,10 @@ def _solver(solver: dict) -> dict:
     return {key: NONE_TEXT if value is None else value for key, value in plain.items()}
 
 
-def _mesh_table(mesh: TetMesh, stem: str, meshes: dict[str, TetMesh]) -> dict:
-    """Return the table of a mesh: its recipe, or its file, which is added to `meshes`."""
+def _mesh_table(mesh: TetMesh | SurfaceMesh, stem: str, meshes: dict[str, TetMesh]) -> dict:
+    """Return the table of a mesh: its recipe, or its file, which is added to `meshes`; of a surface its numbers."""
+    if isinstance(mesh, SurfaceMesh):
+        return {"vertices": mesh.vertices, "triangles": mesh.triangles}
     name = next((name for name, known in meshes.items() if known is mesh), None)
     if mesh.recipe is None and name is None:
         name = f"{stem}_mesh{len(meshes)}.msh"
@@ -149,7 +146,7 @@ def _mesh_table(mesh: TetMesh, stem: str, meshes: dict[str, TetMesh]) -> dict:
 
 
 def _body(body: Body, materials: dict[Material, str], stem: str, meshes: dict[str, TetMesh]) -> dict:
-    composition = body.composition
+    composition, what = body.composition, f"body {body.name!r}"
     names = {body.mesh.region_names.get(key, str(key)): materials[one] for key, one in composition.materials.items()}
     table = {"materials": names} if composition.has_regions else {"material": materials[composition.first]}
     table |= {"mesh": _mesh_table(body.mesh, stem, meshes)}
@@ -164,16 +161,13 @@ def _body(body: Body, materials: dict[Material, str], stem: str, meshes: dict[st
         table["quadrature_degree"] = body.quadrature_degree
     if body.curve is not None:
         shape = next((name for name, known in SHAPES.items() if known is type(body.curve)), None)
-        table["curve"] = body.curve if isinstance(body.curve, str) else {"shape": shape} | _fields(body.curve)
-        if shape is None and not isinstance(body.curve, str):
-            table["curve"] = surface_table(body.curve)
+        of_shape = {"shape": shape} | fields_of(body.curve) if shape else body.curve
+        table["curve"] = _mesh_table(body.curve, stem, meshes) if isinstance(body.curve, SurfaceMesh) else of_shape
     if body.velocity.ndim == 2:
         table["velocity"] = body.velocity[: body.nodes.n_elastic]
     if body.skin is not None:
-        table["skin"] = {"surface": surface_table(body.skin.surface), "contact": body.skin.contact}
-    foreign = FOREIGN_PATH.format("nodes that start elsewhere")
-    chosen = lambda c: {"nodes": _ids(c.nodes, body.nodes.n_elastic)}  # noqa: E731
-    table |= constraint_tables(body, f"body {body.name!r}", chosen, foreign, _fields)
+        table["skin"] = {"surface": _mesh_table(body.skin.surface, stem, meshes), "contact": body.skin.contact}
+    table |= constraint_tables(body, FOREIGN_PATH.format("nodes that start elsewhere"))
     table |= {key: [] for key in ("traction", "force", "pressure", "cavity")}
     if body.fibres is not None and (
         body.mesh.fibres is None or not np.array_equal(body.fibres, directions("", body.mesh, body.mesh.fibres))
@@ -181,39 +175,32 @@ def _body(body: Body, materials: dict[Material, str], stem: str, meshes: dict[st
         table["fibres"] = body.fibres[0] if (body.fibres == body.fibres[0]).all() else body.fibres
     active = [one for one in body.activations if one.path is not None or one.value != 0.0]
     regions = [{} if one.region is None else {"region": body.mesh.region_names.get(one.region, one.region)} for one in active]
-    table["activate"] = [named | {"activation": _load(body, one)} for named, one in zip(regions, active)]
+    table["activate"] = [named | {"activation": load_value(one, what)} for named, one in zip(regions, active)]
     for load in body.loads[: len(body.loads) - len(body.activations)]:
         kind, named = ("cavity", {"name": load.name}) if isinstance(load, Cavity) else (load.kind, {})
         if isinstance(load, NodalForce):
-            where = {"nodes": _ids(load.nodes, body.nodes.n_elastic)}
+            where = nodes_of(body, load.nodes)
         else:
-            where = {"triangles": _ids(load.triangles, len(body.mesh.surface))}
-        table[kind].append(named | where | {load.kind: _load(body, load)})
+            where = {"triangles": ids_of(load.triangles, len(body.mesh.surface))}
+        table[kind].append(named | where | {load.kind: load_value(load, what)})
     return table
 
 
-def _load(body: Body, load: Load):
-    """Return a load's value, or the fields of its key frames."""
-    if load.path is None:
-        return load.value if load.value.ndim else float(load.value)
-    if not isinstance(load.path, LoadPath):
-        raise SceneError(f"body {body.name!r}: has a load along a function, which a file cannot store: use ts.KeyFrames")
-    return _fields(load.path.frames)
-
-
-def _ids(ids: np.ndarray, n: int):
-    return "all" if np.array_equal(ids, np.arange(n)) else ids
-
-
-def _fields(record) -> dict:
-    """Return the fields of a record that are not None."""
-    values = {field.name: getattr(record, field.name) for field in dataclasses.fields(record)}
-    return {key: value for key, value in values.items() if value is not None}
+def _rigid_body(body: RigidBody, stem: str, meshes: dict[str, TetMesh]) -> dict:
+    table, first = {"mesh": _mesh_table(body.shape, stem, meshes), "density": body.density}, body.composition.first
+    linear, angular = body.start_twist
+    table |= {"position": body.position, "velocity": linear, "angular_velocity": angular}
+    table |= {"friction": first.friction, "restitution": first.restitution} | look_of(body)
+    if body.given_young is not None:
+        table["young"] = body.given_young
+    table |= constraint_tables(body, "its position was set after its path with rotations: move it again")
+    forces = [nodes_of(body, one.nodes) | {"force": load_value(one, body._label())} for one in body.forces]
+    return table | {"force": forces}
 
 
 def _material(material: Material) -> dict:
     """Return a material's numbers: of a law with parameters these, from which the moduli follow."""
-    fields, own = _fields(material), _fields(material).pop("parameters")
+    fields, own = fields_of(material), fields_of(material).pop("parameters")
     return {key: value for key, value in fields.items() if key != "parameters" and not (own and key in MODULI)} | own
 
 
@@ -222,56 +209,12 @@ def _obstacle(obstacle: Obstacle) -> dict:
     kind = next((name for name, known in SHAPES.items() if known is type(shape)), None)
     if kind is None:
         raise SceneError(f"obstacle {obstacle.name!r}: a file cannot store a {type(shape).__name__}")
-    table = {"shape": kind} | _fields(shape) | {key: getattr(obstacle, key) for key in SURFACE_KEYS} | look_of(obstacle)
-    if obstacle.given_path is None:
+    table = {"shape": kind} | fields_of(shape) | {key: getattr(obstacle, key) for key in SURFACE_KEYS} | look_of(obstacle)
+    path, what = obstacle.given_path, f"obstacle {obstacle.name!r}"
+    if path is None:
         return table
-    if not isinstance(obstacle.given_path, ShapePath):
-        raise SceneError(f"obstacle {obstacle.name!r}: moves along a function, which a file cannot store: use ts.KeyFrames")
-    frames, own = obstacle.given_path.frames, np.array_equal(obstacle.given_path.center, shape.pivot)
-    if not own and frames.rotations is not None and frames.pivot is not None:  # otherwise the center does not matter
-        raise SceneError(f"obstacle {obstacle.name!r}: {FOREIGN_PATH.format('a shape with another center')}")
-    return table | {"path": _fields(frames)}
-
-
-def toml_of(tables: dict) -> str:
-    """Return nested dicts as TOML: numbers, booleans, strings, lists, arrays, dicts, and lists of dicts."""
-    return "\n".join(_lines(tables, "")).lstrip("\n") + "\n"
-
-
-def _lines(table: dict, place: str) -> list[str]:
-    subtables = {key: value for key, value in table.items() if isinstance(value, dict) or _is_tables(value)}
-    lines = [
-        f"{key_text(key)} = {_toml(value)}"
-        for key, value in table.items()
-        if key not in subtables and not (isinstance(value, list) and not value)
-    ]
-    for key, value in subtables.items():
-        path = key_path(place, key)
-        for subtable in value if isinstance(value, list) else [value]:
-            header = f"[[{path}]]" if isinstance(value, list) else f"[{path}]"
-            inner = _lines(subtable, path)
-            # a table that contains only tables needs no header
-            lines += inner if not isinstance(value, list) and inner[:1] == [""] else ["", header, *inner] if inner else []
-    return lines
-
-
-def _is_tables(value) -> bool:
-    return isinstance(value, list) and bool(value) and isinstance(value[0], dict)
-
-
-def _toml(value) -> str:
-    if isinstance(value, bool):
-        return "true" if value else "false"
-    if isinstance(value, str):
-        return quote(value)
-    if isinstance(value, (int, float)):
-        return repr(value)
-    entries = value.tolist() if isinstance(value, np.ndarray) else value
-    if entries and isinstance(entries[0], list):
-        return "".join(["[", *(f"\n  {_toml(row)}," for row in entries), "\n]"])
-    lines = [""]
-    for text in map(_toml, entries):
-        if lines[-1] and len(lines[-1]) + len(text) > MAX_LINE:
-            lines.append("")
-        lines[-1] += f"{text}, "
-    return f"[{lines[0][:-2]}]" if len(lines) == 1 else "".join(["[", *(f"\n  {line[:-1]}" for line in lines), "\n]"])
+    frames = frames_of(path, ShapePath, f"{what}: moves")
+    own = np.array_equal(path.center, shape.pivot)
+    if not own and {"rotations", "pivot"} <= frames.keys():  # otherwise the center does not matter
+        raise SceneError(f"{what}: {FOREIGN_PATH.format('a shape with another center')}")
+    return table | {"path": frames}

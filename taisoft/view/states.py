@@ -95,11 +95,10 @@ class StoredRun(Guarded):
         self._seal(StoredRun.__init__)
 
     background, lights = Scene.background, Scene.lights
-    camera = checks.attribute(
-        "camera",
-        lambda self, value: check_follow(Scene._check_camera(self, value), self._scene.bodies),
-        "`Camera` of pictures; None: one that frames the start.",
-    )
+    camera = checks.attribute("camera", None, "`Camera` of pictures; None: one that frames the start.")
+
+    def _check_camera(self, value) -> Camera | None:
+        return check_follow(checks.instance(value, "stored run: camera", Camera, optional=True), self.bodies)
 
     @property
     def bodies(self) -> list[DrawnBody]:

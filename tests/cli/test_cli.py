@@ -46,7 +46,7 @@ BAD_SETTINGS = [
     (["--details", "pairs"], "--details pairs: contact forces are not modelled (one body"),
     (["--details", "quantities"], "--details quantities: the run has none"),
     (["--quantity", "reaction beam"], "--quantity reaction beam: write NAME=TEXT"),
-    (["--quantity", "q=reaction bean"], "quantity 'q': scene: no body is called 'bean'; did you mean 'beam'?"),
+    (["--quantity", "q=reaction bean"], "quantity 'q': scene: no body is called 'bean' (did you mean beam?)"),
     (["--set", "gravity=3,1"], "scene: gravity must have shape (3,), not (2,)"),
     (["--set", "solver.dt=1 ms"], "'1 ms' is not a number"),
     (["--seconds", "nan"], "seconds must be finite, not nan"),

@@ -240,7 +240,7 @@ def test_the_largest_pressure_of_a_body(pushing):
         ({"q": "reaction 'block"}, "must begin with its kind, and quotation marks must be closed"),
         ({"q": "reactions block"}, "its kind must be one of .* did you mean 'reaction'"),
         ({"q": "reaction.w block"}, "the component of reaction must be one of x, y, z"),
-        ({"q": "reaction blok"}, "quantity 'q': scene: no body is called 'blok'; did you mean 'block'"),
+        ({"q": "reaction blok"}, "quantity 'q': scene: no body is called 'blok' .did you mean block"),
         ({"q": "reaction block ground"}, "must name reaction of one body"),
         ({"q": "contact_force block block"}, "exerts no net force on itself"),
         ({"q": "displacement block 1 2"}, "a body and three coordinates of a point"),

@@ -146,7 +146,7 @@ def test_scene_files_hold_pressures_and_key_frames_but_no_functions(tmp_path):
     body.add_pressure(np.arange(len(body.mesh.surface)), 7e3)
     body.add_pressure([3, 1], PULL)
     there_and_back(tmp_path / "a.toml", scene, {"dt": 0.01})
-    with pytest.raises(SceneError, match="body 'body': has a load along a function, which a file cannot store: use ts.KeyFrames"):
+    with pytest.raises(SceneError, match="body 'body': has a force along a function, which a file cannot store: use ts"):
         ts.write_scene(tmp_path / "b.toml", free_body(push))
 
 

@@ -80,12 +80,12 @@ def test_scene_files_have_the_recipes(tmp_path):
 @pytest.mark.parametrize(
     "make, text",
     [
-        (lambda: ts.box_mesh((1, 1, 1), (1, 1, 1), grading=(1, 0, 1)), "box_mesh: grading must be positive"),
-        (lambda: ts.ball_mesh(1.0, 4, grading=-1.0), "ball_mesh: grading must be positive"),
+        (lambda: ts.box_mesh((1, 1, 1), (1, 1, 1), grading=(1, 0, 1)), "box_mesh: grading must be greater than 0"),
+        (lambda: ts.ball_mesh(1.0, 4, grading=-1.0), "ball_mesh: grading must be greater than 0"),
         (lambda: ts.ball_mesh(1.0, 4, grading=2.0, towards=(0, 0, 0)), "ball_mesh: towards must be a direction"),
         (lambda: ts.cylinder_mesh(1.0, 1.0, (3, 2)), "cylinder_mesh: cells must be an even integer"),
         (lambda: ts.cylinder_mesh(1.0, 1.0, 4), "cylinder_mesh: cells must be two positive integers"),
-        (lambda: ts.cylinder_mesh(0.0, 1.0, (4, 2)), "cylinder_mesh: radius must be positive"),
+        (lambda: ts.cylinder_mesh(0.0, 1.0, (4, 2)), "cylinder_mesh: radius must be greater than 0"),
         (lambda: ts.cylinder_mesh(1.0, 1.0, (4, 2), axis="w"), "cylinder_mesh: axis must be one of x, y, z"),
         (lambda: ts.cylinder_mesh(1.0, 1.0, (4, 2), grading=2.0, towards=(0, 1, 1)), "towards must be along the axis or perpend"),
     ],

@@ -49,8 +49,8 @@ def test_bad_arguments_are_refused():
     for arguments, message in (
         ({"up": "w"}, "up must be one of x, y, z, not 'w'"),
         ({"to": "x"}, "to must be one of y, z, not 'x'"),
-        ({"scale": 0}, "scale must be a number above 0, not 0"),
-        ({"at": (0, float("inf"), 0)}, r"at must be three finite numbers, not \(0, inf, 0\)"),
+        ({"scale": 0}, "scale must be greater than 0, not 0"),
+        ({"at": (0, float("inf"), 0)}, r"at: entry \[1\] is inf, not finite"),
     ):
         with pytest.raises(MeshError, match=f"place: {message}"):
             ts.place(TOWER, **arguments)

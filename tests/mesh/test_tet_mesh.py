@@ -9,7 +9,7 @@ from taisoft.errors import MeshError
 from taisoft.mesh.quality import edge_lengths, mean_ratio, mean_surface_edge
 from taisoft.mesh.shapes import box_mesh
 from taisoft.mesh.tet_mesh import TetMesh
-from taisoft.mesh.topology import TET_FACES, merge_labels
+from taisoft.mesh.topology import TET_FACES, merged_points
 
 CORNER = np.array([(0.0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1)])  # a positive tet
 REGULAR = np.array([(1.0, 1, 1), (-1, 1, -1), (1, -1, -1), (-1, -1, 1)])
@@ -110,15 +110,15 @@ def two_boxes(shift) -> TetMesh:
     """Two unit boxes of one cell, the second shifted; coincident vertices are merged."""
     box = box_mesh((1, 1, 1), (1.0, 1.0, 1.0), pattern="six")
     vertices = np.vstack([box.vertices, box.vertices + np.asarray(shift, dtype=float)])
-    labels = merge_labels(vertices, 1e-9)
+    labels = merged_points(vertices, 1e-9)[1]
     first = np.unique(labels, return_index=True)[1]
     return TetMesh(vertices[first], labels[np.vstack([box.tets, box.tets + box.n_verts])])
 
 
-def test_merge_labels_is_transitive_and_keeps_the_order_and_components_are_counted():
+def test_merging_is_transitive_and_keeps_the_order_and_components_are_counted():
     points = np.array([(3.0, 0, 0), (0, 0, 0), (0.9, 0, 0), (1.8, 0, 0), (0, 0, 0), (-0.0, 0, 0)])
-    assert merge_labels(points, 0.0).tolist() == [0, 1, 2, 3, 1, 1]
-    assert merge_labels(points, 1.0).tolist() == [0, 1, 1, 1, 1, 1]
+    assert merged_points(points, 0.0)[1].tolist() == [0, 1, 2, 3, 1, 1]
+    assert merged_points(points, 1.0)[1].tolist() == [0, 1, 1, 1, 1, 1]
     for shift, n_verts, n_components in (((5, 0, 0), 16, 2), ((1, 0, 0), 12, 1)):
         mesh = two_boxes(shift)
         assert mesh.n_verts == n_verts and mesh.n_components == n_components and mesh.warnings == []

@@ -100,7 +100,7 @@ def test_a_number_that_is_set_is_that_of_a_scene_made_with_it():
         ("body.traction.0", [1.0, 2.0], "body 'body': set_traction: traction 0 must have shape (3,), not (2,)"),
         ("a.ball.restitution", 2.0, "'a.ball': restitution must be at least 0 and at most 1, not 2.0"),
         ("rope.length", 0.0, "tendon 'rope': length"),
-        ("contact.a.ball.bode.friction", 0.1, "no body or obstacle is called 'bode'; did you mean 'body'?"),
+        ("contact.a.ball.bode.friction", 0.1, "no body or obstacle is called 'bode' (did you mean body?)"),
         ("contact.a.ball.friction", 0.1, "no body or obstacle is called"),
     ],
 )

@@ -67,7 +67,7 @@ def test_invalid_obstacles_are_refused():
         (lambda: ts.Sphere((0, 0, 0), 0), "^sphere: radius must be greater than 0 m, not 0"),
         (lambda: ts.Box((0, 0, 0), (1, 0, 1)), r"^box: half_extents must be greater than 0 m, not \[1.0, 0.0, 1.0\]"),
         (lambda: ts.Capsule((0, 1, 0), (0, 1, 0), 1), "^capsule: a and b must not be the same point"),
-        (lambda: ts.MeshObstacle(TETRA[:, :2], FACES), r"^mesh obstacle: vertices must have shape \(4, 3\), not \(4, 2\)"),
+        (lambda: ts.MeshObstacle(TETRA[:, :2], FACES), r"^mesh obstacle: vertices must have shape \(n, 3\), not \(4, 2\)"),
         (lambda: ts.MeshObstacle(TETRA, FACES[:, :2]), r"^mesh obstacle: triangles must have shape \(n, 3\), not \(4, 2\)"),
         (lambda: ts.MeshObstacle(TETRA, FACES + 1), r"^mesh obstacle: triangle 1: vertex 4 does not exist \(4 vertices"),
         (lambda: ts.MeshObstacle(TETRA, [(0, 1, 2), (3, 1, 1)]), r"^mesh obstacle: triangle 1 \(3, 1, 1\) has no area"),

@@ -125,7 +125,7 @@ def test_bodies_and_obstacles_are_found_by_name(scene):
     assert scene.add_body(MESH, Material()).name == "body2" and scene.colliders == [*scene.bodies, *scene.obstacles]
     ground = scene.obstacle("ground")
     assert (ground.shape, ground.friction, ground.restitution, ground.path) == (GROUND, 0.1, 0.2, None)
-    with pytest.raises(SceneError, match="no obstacle is called 'ground'; the scene has none"):
+    with pytest.raises(SceneError, match="no obstacle is called 'ground'; there are none"):
         Scene().obstacle("ground")
 
 
@@ -136,8 +136,8 @@ def add(**options):
 REFUSALS = [  # the call on a scene and its body "a", and the message
     *((lambda s, b, g=g: setattr(s, "gravity", g), "^scene: gravity") for g in ((0, -9.81), "down", (0, np.nan, 0), None)),
     (lambda s, b: Scene(gravity=(0, -9.81)), "^scene: gravity"),
-    (lambda s, b: s.body("aa"), "no body is called 'aa'; did you mean 'a'"),
-    (lambda s, b: s.obstacle("grund"), "no obstacle is called 'grund'; did you mean 'ground'"),
+    (lambda s, b: s.body("aa"), "no body is called 'aa' .did you mean a[?]"),
+    (lambda s, b: s.obstacle("grund"), "no obstacle is called 'grund' .did you mean ground"),
     (lambda s, b: s.add_obstacle(GROUND, name="a"), "obstacle name 'a' is taken"),
     (lambda s, b: s.add_obstacle(GROUND, name=" "), "obstacle name must be a text"),
     (add(name="ice"), "body name 'ice' is taken"),
@@ -166,7 +166,7 @@ REFUSALS = [  # the call on a scene and its body "a", and the message
     (lambda s, b: b.add_traction([], (0, 1, 0)), "no surface triangle is chosen"),
     *((lambda s, b, v=v: b.add_traction([0], v), "add_traction: traction") for v in ((0, 1), 5.0, (0, np.nan, 0), "up")),
     *((lambda s, b, v=v: b.add_force([0], v), "add_force: force") for v in ((0, 1), 5.0, (0, np.nan, 0), "up")),
-    (lambda s, b: s.set_contact("a", "grond", friction=1), "^scene: .*no body or obstacle is called 'grond'; did you mean 'gro"),
+    (lambda s, b: s.set_contact("a", "grond", friction=1), "^scene: .*no body or obstacle is called 'grond' .did you mean gro"),
     (lambda s, b: s.set_contact("ground", "ice", friction=1), "^scene: .*'ground' and 'ice': one of the two must be a body"),
     (lambda s, b: s.set_contact("a", "b"), "^scene: .*'a' and 'b': give friction or restitution"),
     (lambda s, b: s.set_contact("a", "b", friction=-1), "^scene: .*'a' and 'b': friction must be at least 0"),

@@ -13,7 +13,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import taisoft as ts
-from taisoft.scene.toml_writer import toml_of
+from taisoft.scene.toml_values import toml_of
 from tests.cli.command import write
 from tests.scene.toml_scenes import MESH, TEXT, TURNED, floats, read
 

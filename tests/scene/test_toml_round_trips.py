@@ -178,7 +178,7 @@ def test_scenes_that_a_file_cannot_store_are_refused(tmp_path):
     refused("body 'a': rotates along a path made for nodes that start elsewhere")
     body.constraints.clear()
     tendon = scene.add_tendon([("a", 0), ("a", 5)], lambda t: 1.0, name="line")
-    refused("tendon 'line': its force is a function, which a file cannot store: use ts.Key")
+    refused("tendon 'line': has a force along a function, which a file cannot store: use ts.Key")
     scene.tendons.remove(tendon)
     late = scene.add_rigid_body(TURNED, name="late")
     late.move(ts.KeyFrames((0, 1), rotations=[(0, 0, 0), (0, 1, 0)]))

@@ -39,6 +39,7 @@ ORDER = (
     ("backend.counters",),
     ("backend.runtime",),
     ("backend.parallel", "backend.lists"),
+    ("scene.checks",),
     ("mesh", "scene"),
     ("fem.state", "fem.math3", "fem.chunks", "fem.spring_table", "fem.dependent_table"),
     ("fem.node_graph", "fem.model", "fem.reference"),
