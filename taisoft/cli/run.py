@@ -332,7 +332,6 @@ def _run(sim, settings: RunSettings, arguments, signals, warned: list[str], save
 
 def _report_failed_output(result: RunReport, observers: Observers, signals: Signals) -> None:
     """Add all output errors to the run's report: report.json may still fit on the disk when a picture did not."""
-    result.problems += [error for error in observers.errors if error not in result.problems]
     if observers.errors:
+        result.degrade(*(error for error in observers.errors if error not in result.problems))
         result.interrupted = result.interrupted and signals.requested()
-        result.status = "degraded" if result.status == "ok" else result.status

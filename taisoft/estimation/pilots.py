@@ -19,7 +19,8 @@ import numpy as np
 from taisoft.estimation.comparison import largest_excursion
 from taisoft.estimation.costs import COUNTS
 from taisoft.ranges import owners
-from taisoft.records import RunReport, StepReport
+from taisoft.records import RunReport
+from taisoft.running import RunRequest, StepCallback, run_steps
 
 if TYPE_CHECKING:
     from taisoft.simulator import Simulator
@@ -32,9 +33,6 @@ BLOCK = 64  # frames whose velocities are held until their changes are added
 HELD_NODES = 100_000  # nodes of all states at ends of parts that are held until then: 5 to 10 MB
 MAX_NODES = 4096  # whose paths are recorded, evenly spread
 HARDEST, FASTEST = "hardest", "fastest"  # parts: of the largest changes of velocities, and of the largest velocities
-
-RunFunction = Callable[..., RunReport]  # as `running.run_steps`
-StepCallback = Callable[[StepReport, float], None]  # its on_step
 
 
 @dataclass(frozen=True)
@@ -202,7 +200,6 @@ class Frames:
         sim: "Simulator",
         per_frame: Fraction,
         stop: Callable[[], bool] | None,
-        run: RunFunction,
         part: Part | None = None,
         keeps: tuple[str, ...] = (),
         on_step: StepCallback | None = None,
@@ -210,7 +207,7 @@ class Frames:
         """Run a pilot of `per_frame` steps a frame; its report has the status "failed" if it fails. Restores sim's state.
 
         part: of another pilot, which alone is to be run; keeps: own parts before which to keep the state; stop, on_step: as for
-        `run`.
+        `Simulator.run`.
         """
         pilot = Pilot(sim.settings.integrator, per_frame)
         kept, may_soften = sim._dynamics.snapshot(), sim._may_soften
@@ -226,7 +223,8 @@ class Frames:
                 warnings.simplefilter("always")  # they are those of the run only if the pilot is
                 sim.dt = self.seconds / float(per_frame)
                 recorder = Recorder(pilot, self, Fraction(stride), first, keeps)
-                pilot.report = run(sim, length, recorder.frame, 1.0 / (self.seconds * stride), stop, on_step=on_step)
+                request = RunRequest(length, 1.0 / (self.seconds * stride), stop, on_frame=recorder.frame, on_step=on_step)
+                pilot.report = run_steps(sim, request)
                 recorder.add_changes()
             pilot.end = sim._dynamics.snapshot()
             pilot.warned = list(dict.fromkeys(str(one.message) for one in caught if issubclass(one.category, UserWarning)))

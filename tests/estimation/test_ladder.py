@@ -15,7 +15,7 @@ from taisoft.estimation.first_choice import settings_for, stable_steps
 from taisoft.estimation.ladder import Ladder
 from taisoft.estimation.pilots import FASTEST, HARDEST, Frames, Part, Pilot, distances, make_frames
 from taisoft.records import RunReport
-from taisoft.running import run_steps
+from taisoft.running import RunRequest, run_steps
 from taisoft.settings import Settings
 from tests.dynamics.scenes import cube, rubber
 from tests.estimation.stand_in import BDF2, VERLET, block, motion
@@ -136,21 +136,21 @@ def test_the_hardest_part_is_that_of_an_impact():
     sim.advance(3)
     before = sim.snapshot()
     frames = make_frames(sim, 0.6, 1 / 60)
-    pilot = frames.pilot(sim, Fraction(17), None, run_steps, keeps=(HARDEST, FASTEST))
+    pilot = frames.pilot(sim, Fraction(17), None, keeps=(HARDEST, FASTEST))
     hardest, fastest = pilot.parts[HARDEST], pilot.parts[FASTEST]
-    part = frames.pilot(sim, Fraction(17), None, run_steps, part=hardest)
+    part = frames.pilot(sim, Fraction(17), None, part=hardest)
     assert all(np.array_equal(before[name], sim.snapshot()[name]) for name in before if before[name] is not None)
     assert 27 <= hardest.first <= 31 and fastest.first >= 25 and hardest.times > 1.5 and fastest.times > 3.0
     assert pilot.jump > 2.0
     assert part.frames == list(range(hardest.first, hardest.first + frames.part + 1))
     assert np.array_equal(part.at(part.frames), pilot.at(part.frames))
     assert pilot.end["step_count"] == 3 + 36 * 17 and pilot.touches and not part.counts_per_step()[0]
-    coarser = frames.pilot(sim, Fraction(1, 4), None, run_steps)
+    coarser = frames.pilot(sim, Fraction(1, 4), None)
     assert coarser.frames == list(range(0, 37, 4)) and coarser.report.steps == 9
     found, ends = distances(pilot, coarser), pilot.positions[-1] - coarser.positions[-1]
     assert found.shape == (10, 8) and np.allclose(found[-1], np.linalg.norm(ends, axis=1), rtol=1e-15)
-    pilot, seen, sim.dt = make_frames(sim, 0.6, 1 / 250).pilot(sim, Fraction(4), None, run_steps), [], 1 / 1000
-    run_steps(sim, 0.6, lambda sim, *_: seen.append(sim.v), 250.0, None)
+    pilot, seen, sim.dt = make_frames(sim, 0.6, 1 / 250).pilot(sim, Fraction(4), None), [], 1 / 1000
+    run_steps(sim, RunRequest(0.6, 250.0, on_frame=lambda sim, *_: seen.append(sim.v)))
     assert pilot.frames == [*range(0, 150, 4), 150]  # fewer than 48, and the last
     changes = np.diff(seen, axis=0)
     assert pilot.jump == pytest.approx(np.linalg.norm(changes, axis=2).max()) and len(seen) == 151
