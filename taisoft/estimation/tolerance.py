@@ -23,7 +23,7 @@ from fractions import Fraction
 from typing import TYPE_CHECKING
 
 from taisoft.errors import SimulationError
-from taisoft.estimation.costs import Budget, Spent, explicit_step, implicit_step
+from taisoft.estimation.costs import Spent, budget, explicit_step, implicit_step
 from taisoft.estimation.first_choice import EXPLICIT, IMPLICIT, stable_steps
 from taisoft.estimation.ladder import SMALLER, Ladder, implicit_sizes, slightly_more
 from taisoft.estimation.order import is_smooth, may_jump, nominal_order
@@ -154,9 +154,9 @@ class Chooser:
         while True:
             per_frame = next(sizes)
             steps = float(per_frame) * self._frames.count
-            budget = Budget(sim.scene, sim.touches, explicit / max(1.0, float(per_frame)), steps)
+            add_cost = budget(sim.scene, sim.touches, explicit / max(1.0, float(per_frame)), steps)
             try:
-                ladder.add(self._pilot(per_frame, on_step=budget.add))
+                ladder.add(self._pilot(per_frame, on_step=add_cost))
             except Spent:
                 return None
             needed = ladder.steps_needed(self._tolerance)
@@ -301,13 +301,13 @@ class Chooser:
         ladder, bodies = self.ladder, self._sim.scene.bodies
         made = ErrorEstimate(bodies={body.name: BodyError() for body in bodies}, twins=[f"pilots with {self._pilot_steps()}"])
         last = ladder.pilots[-1]
-        made.excursion = ladder.excursion(run if len(run.frames) > 1 else last)
+        made.excursion = ladder.excursion(run if len(run.positions) > 1 else last)
         if made.excursion == 0.0:
             made.time = 0.0
             made.notes.append("nothing moves but by rounding")
         elif ladder.diverges:
             made.notes.append("the error in time is unknown: the paths of different steps diverge")
-        elif len(run.frames) < 2 or not (coarser := [one for one in ladder.pilots if one.per_frame < run.per_frame]):
+        elif len(run.positions) < 2 or not (coarser := [one for one in ladder.pilots if one.per_frame < run.per_frame]):
             made.time = ladder.error
             if len(ladder.pilots) == 1:
                 made.notes.append(
