@@ -19,7 +19,7 @@ from taisoft.estimation.order import nominal_order
 from taisoft.scene.scene import Scene
 from taisoft.settings import WITH_MULTIPLIERS, check_settings, kept_by_multipliers
 from taisoft.stability import stable_dt
-from taisoft.study import AXES, DEFAULTS, Setting, mesh_name
+from taisoft.study import AXES, DEFAULTS, Setting, mesh_name, simulator_arguments
 
 IMPLICIT_DEFAULT = ("implicit_euler", "bdf2")
 DT_FACTORS = {False: (2.0, 1.0, 0.5, 0.25), True: (0.5, 1.0, 4.0, 8.0, 16.0)}  # of the scene's dt; key: explicit integrator
@@ -76,7 +76,7 @@ def frame_time(steps: Iterable[float], seconds: float) -> tuple[float, int]:
 class Planner:
     """Plans the runs of a scene's variants; scenes and stability limits are computed once. A mesh is (refine, order).
 
-    request: see `Request.for_plan`.
+    request: the fields of a `Request`.
     """
 
     def __init__(self, variant: Variant, solver: dict, request: dict):
@@ -186,7 +186,7 @@ class Planner:
         return "velocity_verlet" if not kind and limit > 2.0 * target / EXPLICIT_DT_RATIO else "implicit_midpoint"
 
     def _check(self, scene: Scene, setting: Setting) -> None:
-        check_settings(scene, **setting.simulator(), **self.fixed)
+        check_settings(scene, **simulator_arguments(asdict(setting)), **self.fixed)
 
     def _touches(self, scene: Scene) -> bool:
         return scene.pushes(self.fixed.get("self_collision", False))

@@ -1,7 +1,7 @@
 """Run a study: plan it, execute the missing runs, and compare each with its reference. No Taichi here: every run is a process."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 
 from taisoft.errors import SceneError, SimulationError
 from taisoft.estimation.comparison import Error
@@ -72,7 +72,7 @@ class Runner:
         Return None if interrupted. Raises SceneError if the scene cannot be studied.
         """
         answers: dict[str, dict] = {}
-        requests = [("plan", self._request("plan") | {"request": self.request.for_plan()})]
+        requests = [("plan", self._request("plan") | {"request": asdict(self.request)})]
         if carry_out(requests, [self.planner], answers.__setitem__, stop_requested=self.stop_requested):
             return None
         found = answers["plan"]
