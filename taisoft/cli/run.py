@@ -96,9 +96,13 @@ def run(arguments: Namespace) -> int:
             settings = resolve(solver, arguments, Simulator, kept)
             if "dt" in settings.changed and saved.settings.get("tolerance") is not None:
                 raise SceneError(f"--resume {arguments.resume}: its dt was chosen for a tolerance and cannot change in a run")
-            sim = _resumed(saved, scene, settings)
+            sim = Simulator.from_checkpoint(saved, scene, arch=settings.simulator["arch"])
         settings.numbers = numbers
         with sim:
+            if "dt" in settings.changed:
+                sim.dt = settings.simulator["dt"]
+            if saved is not None:
+                print(f"resumed  from {saved.path}, t = {sim.time:.6g} s")
             check_modelled(shown, sim)
             print_plan(sim, arguments.verbose)
             if interactive:
@@ -216,19 +220,6 @@ def _check_tolerance(settings: RunSettings, interactive: bool) -> None:
         raise SceneError("--tolerance: a window without end has no run to choose steps for: give --seconds, or --out")
     if settings.fps is None:
         raise SceneError("--tolerance needs frames at a rate, not after every step: give --fps")
-
-
-def _resumed(saved: Checkpoint, scene: Scene, settings: RunSettings) -> Simulator:
-    """Return the resumed simulator, with another dt if requested."""
-    sim = Simulator.from_checkpoint(saved, scene, arch=settings.simulator["arch"])
-    if "dt" in settings.changed:
-        try:
-            sim.dt = settings.simulator["dt"]
-        except BaseException:
-            sim.close()
-            raise
-    print(f"resumed  from {saved.path}, t = {sim.time:.6g} s")
-    return sim
 
 
 def _check_time_left(sim: Simulator, settings: RunSettings, arguments: Namespace) -> None:

@@ -14,12 +14,12 @@ is not seen. Rounding is not estimated.
 
 import dataclasses
 import time
-import warnings
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from taisoft.dynamics.schemes import SECOND_ORDER
+from taisoft.errors import collected_warnings
 from taisoft.estimation import quantities
 from taisoft.estimation.comparison import Differences
 from taisoft.estimation.order import MESH_ORDER, MIN_ORDER, agreement, error_over_difference, nominal_order, observed_order
@@ -65,8 +65,7 @@ class ErrorEstimator:
         self._energies = np.zeros(4)  # differences to the first twin at the last comparison [J]
         self._means: list[list[np.ndarray]] = []  # per comparison: mean positions of the bodies, of the run and of the first twin
         try:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore", UserWarning)  # the run has given them
+            with collected_warnings():  # the run has given them
                 self._make_twins(steps, mesh)
         except BaseException:
             self.close()
@@ -115,8 +114,7 @@ class ErrorEstimator:
             self._made = None  # an estimate read before the change
             return
         begin, compiled = time.perf_counter(), self._sim.compile_seconds
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)  # of twins, not of the run
+        with collected_warnings():  # of twins, not of the run
             for twin in self._twins:
                 twin.follow(steps)
         self._compare()

@@ -7,7 +7,6 @@ there for a small part of the cost.
 """
 
 import math
-import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
@@ -16,6 +15,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from taisoft.errors import collected_warnings
 from taisoft.estimation.comparison import largest_excursion
 from taisoft.estimation.costs import COUNTS
 from taisoft.ranges import owners
@@ -194,14 +194,12 @@ class Frames:
         try:
             if part is not None:
                 sim._dynamics.restore(part.state)
-            with warnings.catch_warnings(record=True) as caught:
-                warnings.simplefilter("always")  # they are those of the run only if the pilot is
+            with collected_warnings() as pilot.warned:  # which the run has only if the pilot is the run
                 sim.dt = self.seconds / float(per_frame)
                 recorder = Recorder(pilot, self, Fraction(stride), first, keeps)
                 request = RunRequest(length, 1.0 / (self.seconds * stride), stop, on_frame=recorder.frame, on_step=on_step)
                 pilot.report = run_steps(sim, request)
             pilot.end = sim._dynamics.snapshot()
-            pilot.warned = list(dict.fromkeys(str(one.message) for one in caught if issubclass(one.category, UserWarning)))
         finally:
             sim._dynamics.restore(kept)
             sim._may_soften = may_soften

@@ -22,7 +22,7 @@ from dataclasses import replace
 from fractions import Fraction
 from typing import TYPE_CHECKING
 
-from taisoft.errors import SimulationError
+from taisoft.errors import SimulationError, collected_warnings
 from taisoft.estimation.costs import Spent, budget, explicit_step, implicit_step
 from taisoft.estimation.first_choice import EXPLICIT, IMPLICIT, stable_steps
 from taisoft.estimation.ladder import SMALLER, Ladder, implicit_sizes, slightly_more
@@ -31,7 +31,7 @@ from taisoft.estimation.pilots import FASTEST, HARDEST, Part, Pilot, Recorder, d
 from taisoft.estimation.vibrations import ERROR as VIBRATIONS
 from taisoft.estimation.vibrations import add_vibrations, are_passed_over
 from taisoft.records import BodyError, ErrorEstimate, RunReport
-from taisoft.running import RunRequest, StepCallback, run_steps
+from taisoft.running import RunRequest, run_steps
 from taisoft.scene.scene import Scene
 from taisoft.stability import stable_dt
 
@@ -142,8 +142,7 @@ class Chooser:
     def _use(self, integrator: str, dt: float) -> None:
         """Let the simulator have an integrator, and begin its ladder."""
         if self._sim.settings.integrator != integrator:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore", UserWarning)  # the simulator has given them
+            with collected_warnings():  # the simulator has given them
                 self._sim._replace(integrator=integrator, dt=dt)
         self.ladder = self._ladder()
 
@@ -227,14 +226,12 @@ class Chooser:
             raise SimulationError(f"every pilot failed, the last one because of {self._last_failure[1]}")
         return math.ceil(self.ladder.pilots[-1].per_frame)
 
-    def _pilot(
-        self, per_frame: Fraction, part: Part | None = None, keeps: tuple[str, ...] = (), on_step: StepCallback | None = None
-    ) -> Pilot:
+    def _pilot(self, per_frame: Fraction, part: Part | None = None, **options) -> Pilot:
         """Run a pilot, see `Frames.pilot`.
 
         Raises SimulationError if it and the one before fail: smaller steps do not help.
         """
-        pilot = self._frames.pilot(self._sim, per_frame, self._request.stop, part, keeps, on_step)
+        pilot = self._frames.pilot(self._sim, per_frame, self._request.stop, part, **options)
         report, before = pilot.report, self._last_failure
         self.compile_seconds += report.compile_seconds
         if report.interrupted:

@@ -1,12 +1,11 @@
 """One run of a study, in its own process: recorded once at the frames, then timed from the start without recording."""
 
 import time
-import warnings
 
 import numpy as np
 
 from taisoft.backend import runtime
-from taisoft.errors import SimulationError, TaisoftError
+from taisoft.errors import SimulationError, TaisoftError, collected_warnings
 from taisoft.fem.loads import SceneLoads
 from taisoft.fem.reference import gravity_mass, lumped_mass
 from taisoft.machine import load_average, usable_cores
@@ -30,10 +29,8 @@ def measure(scene: Scene, task: dict) -> dict:
     setting = simulator_arguments(task["setting"])
     record = {"task": task, "machine": machine(), "versions": versions(), "cores": usable_cores(), "load": load_average()}
     record |= _scene_facts(scene, task)
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always", UserWarning)
+    with collected_warnings() as record["warnings"]:
         record |= _run(scene, setting | task["fixed"], task)
-    record["warnings"] = list(dict.fromkeys(str(one.message) for one in caught if issubclass(one.category, UserWarning)))
     return record | {"load_at_the_end": load_average(), "peak_memory_bytes": peak_memory(), "threads": runtime.threads()}
 
 

@@ -17,13 +17,11 @@ Point = tuple[float, float]  # time, error; smaller is better in both
 
 def front(points: Sequence[Point]) -> list[int]:
     """Return indices of the points that no other dominates, by rising time. Equal points are all included or none; nan never."""
-    known = [k for k, p in enumerate(points) if not any(map(math.isnan, p))]
+    known = (k for k, p in enumerate(points) if not any(map(math.isnan, p)))
     found: list[int] = []
-    lowest = math.inf
     for k in sorted(known, key=lambda k: points[k]):
-        if points[k][1] < lowest or (found and points[k] == points[found[-1]]):
+        if not found or points[k][1] < points[found[-1]][1] or points[k] == points[found[-1]]:
             found.append(k)
-            lowest = min(lowest, points[k][1])
     return found
 
 
@@ -231,11 +229,7 @@ def plain_of(study: Study) -> dict:
         "references": [{k: getattr(r, k) for k in reference_keys} | {"in_space": r is study.space} for r in study.references],
         "cheapest": cheapest and cheapest.setting,
         "nearest": nearest and nearest.setting,
-        "notes": study.notes,
-        "ended": study.ended,
-        "machines": study.machines,
-        "workers": study.workers,
-        "versions": study.versions,
+        **{key: getattr(study, key) for key in ("notes", "ended", "machines", "workers", "versions")},
         "scene_digest": study.plan["scenes"]["refine 0"],
         "code_digest": study.plan["code"],
     }
