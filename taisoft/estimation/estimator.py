@@ -23,7 +23,7 @@ from taisoft.errors import collected_warnings
 from taisoft.estimation import quantities
 from taisoft.estimation.comparison import Differences
 from taisoft.estimation.order import MESH_ORDER, MIN_ORDER, agreement, error_over_difference, nominal_order, observed_order
-from taisoft.estimation.twins import TIGHTER, Twin, larger_steps, on_mesh, smaller_steps, tighter
+from taisoft.estimation.twins import TIGHTER, Twin, on_mesh, other_steps, tighter
 from taisoft.ranges import owners
 from taisoft.records import BodyError, Energies, ErrorEstimate, Quantity
 from taisoft.scene.rigid import RigidBody
@@ -32,7 +32,6 @@ from taisoft.scene.scene import Scene
 if TYPE_CHECKING:
     from taisoft.simulator import Simulator
 
-MIN_STEPS = 32  # of a run whose error is estimated by larger steps
 SOLVER_ORDER = 1  # errors are about proportional to the tolerances
 SOLVER_FACTOR = error_over_difference(TIGHTER, SOLVER_ORDER)
 PARTED = 0.1  # with one twin: difference, over the excursion, above which paths may have parted for good
@@ -83,9 +82,7 @@ class ErrorEstimator:
             self._width = nearest and [nearest]
             factors = [error_over_difference(r, MESH_ORDER) if r else 1.0 for r in ratios]  # 1: the order differs, not the width
             of_mesh = {"space": (self._add(twin), np.array(factors))}
-        self._in_time = [self._add(twin) for twin in larger_steps(sim)] if steps >= MIN_STEPS else []
-        if not self._in_time:
-            self._in_time.append(self._add(smaller_steps(sim)))
+        self._in_time = [self._add(twin) for twin in other_steps(sim, steps)]
         tight = tighter(sim)
         of_solver = {} if tight is None else {"solver": (self._add(tight), np.full(len(self._sizes), SOLVER_FACTOR))}
         self._others = of_solver | of_mesh
