@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 FrameCallback = Callable[["Simulator", int, StepReport | None], None]
 StepCallback = Callable[[StepReport, float], None]
 IterationCallback = Callable[[int], None]
-LARGEST = ("n_inverted", "contact_residual", "max_penetration", "n_contacts", "dropped_contacts", "crossings", "deep")
+MAXIMA = ("n_inverted", "contact_residual", "max_penetration", "n_contacts", "dropped_contacts", "crossings", "deep")
 LONG_STEP, LOOK_EVERY = 1.0, 0.2  # wall time from which an implicit step is long, and between looks at it [s]
 
 
@@ -226,11 +226,11 @@ def timed_advance(sim: "Simulator", n: int, on_step: StepCallback | None) -> Ste
 
 
 def _merge(a: StepReport, b: StepReport) -> StepReport:
-    """Merge two reports of explicit steps into the later one, b: extremes and sums of both, the rest from b."""
+    """Merge two reports of explicit steps into the later one, b: extremes (MAXIMA) and sums of both, the rest from b."""
     b.steps += a.steps
     b.min_volume_ratio = min(a.min_volume_ratio, b.min_volume_ratio)
     b.contact_iterations += a.contact_iterations
-    for name in LARGEST:
+    for name in MAXIMA:
         setattr(b, name, max(getattr(a, name), getattr(b, name)))
     b.contact_error = b.contact_error or a.contact_error
     b.converged = a.converged and b.converged
