@@ -12,7 +12,6 @@ from taisoft.backend.runtime import open_runtime
 from taisoft.dynamics.schemes import EXPLICIT
 from taisoft.errors import TaisoftError
 from taisoft.scene.scene import Scene
-from taisoft.study.measure import advance
 
 from .contact_colouring import measure_crossover
 from .elasticity_runs import MARGIN, beam_scene
@@ -20,6 +19,7 @@ from .programs import own
 from .programs.session import Setting
 from .runner import patched, print_result, warm_up
 from .scaling_runs import cubes_on_ground
+from .timed_run import advance
 from .works.evaluation import evaluate
 from .works.references import MUJOCO, TAISOFT
 from .works.scenes import WORKS, Work

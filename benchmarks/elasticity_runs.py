@@ -19,12 +19,12 @@ from taisoft.errors import SimulationError
 from taisoft.machine import Timing, summarise
 from taisoft.scene.scene import Scene
 from taisoft.stability import stable_dt
-from taisoft.study.measure import TimedRun, advance
 
 from .exact_path import DENSITY, FOLDING_STARTS, GRAVITY, POISSON, SAMPLE, SIZE, YOUNG, load_exact
 from .programs.mujoco_flex import STABLE_STEPS, run_mujoco
 from .reference_cases.record import LAWS
 from .runner import progress, warm_up
+from .timed_run import TimedRun, advance
 
 MARGIN = 0.9  # step over the largest stable step about the rest shape
 IMPLICIT = ("bdf2", "implicit_midpoint", "implicit_euler", "linearly_implicit_euler")

@@ -14,12 +14,12 @@ import taisoft as ts
 from taisoft.dynamics.schemes import EXPLICIT
 from taisoft.machine import Timing, summarise
 from taisoft.output.tables import percent, spread_of
-from taisoft.study.measure import advance
 
 from .document import Limit, table
 from .elasticity_runs import LAWS, beam_scene, n_tets, steps_within_limit
 from .exact_path import SAMPLE
 from .runner import warm_up
+from .timed_run import advance
 
 SAMPLE_SECONDS = 0.05  # approximate wall time of a sample
 GUESSED_SECONDS_PER_TET = 12e-9  # of a step, to size a sample; measured on the CPU: 5 to 30 ns

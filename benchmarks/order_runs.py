@@ -13,12 +13,12 @@ import taisoft as ts
 from taisoft.backend.runtime import Runtime, compile_clock
 from taisoft.errors import SimulationError, TaisoftError
 from taisoft.machine import Timing, summarise
-from taisoft.study.measure import TimedRun, advance
 
 from .order_cases import Case, Element, Reference
 from .reference_cases.motion import parabola_vertex
 from .reference_cases.record import label, nearest
 from .runner import progress, repeated, timed, without_warnings
+from .timed_run import TimedRun, advance
 
 TOLERANCE = 1e-6  # of |residual| / |load|
 FALL_SECONDS = 1.2  # the first swing is over

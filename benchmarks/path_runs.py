@@ -14,12 +14,12 @@ from taisoft.collision.detector import Detection
 from taisoft.dynamics.contact import ContactStep
 from taisoft.dynamics.contact_paths import ContactPaths
 from taisoft.scene.obstacles import Capsule, HalfSpace, Sphere
-from taisoft.study.measure import advance
 
 from .hard_cases.case import Session
 from .hard_runs import find
 from .programs import own
 from .runner import patched, timed, without_warnings
+from .timed_run import advance
 from .works.scenes import WORKS
 
 Made = tuple[ts.Scene, dict]  # a scene and settings of its simulator

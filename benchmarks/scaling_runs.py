@@ -32,7 +32,6 @@ from taisoft.linear import block_csr, pcg
 from taisoft.machine import Timing, summarise
 from taisoft.output.report import peak_memory
 from taisoft.scene.scene import Scene
-from taisoft.study.measure import advance
 
 from .collision_cases import pile_setup, two_cubes
 from .collision_runs import Rig
@@ -41,6 +40,7 @@ from .elasticity_runs import MARGIN, beam_scene, n_tets
 from .elasticity_steps import LONGEST_FALL, MAX_STEPS, SAMPLE_SECONDS
 from .runner import Stopwatch, clock, patched, repeated, timed, warm_up
 from .scaling_bytes import floor_bytes, group_bytes
+from .timed_run import advance
 
 DT, TINY_DT = 0.01, 1e-6  # [s] of implicit steps; of explicit ones until their limit is known
 MIN_STEPS = 25  # of a sample of explicit steps: frames of large meshes are a hundred steps and more apart

@@ -62,9 +62,7 @@ class EnergyCheck:
     def add_problem(self, report: RunReport) -> None:
         """Add a problem to the report if energy was created; its status is then no longer ok."""
         if self._worst[0] > MAX_RISE:
-            report.problems.append(_message(*self._worst))
-            if report.status == "ok":
-                report.status = "degraded"
+            report.degrade(_message(*self._worst))
 
     def _restart(self) -> None:
         """Restart the check from the present state and parameters."""

@@ -1,5 +1,6 @@
 """Errors that users can get. Each message is one sentence: the object, the index, the rule it breaks."""
 
+import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
@@ -39,6 +40,16 @@ def reworded(
         yield
     except caught as error:
         raise (raised or type(error))(prefix + str(error).removeprefix(without)) from error.__cause__
+
+
+@contextmanager
+def collected_warnings() -> Iterator[list[str]]:
+    """Yield a list that holds the distinct texts of the block's UserWarnings at its end; none is shown."""
+    texts: list[str] = []
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", UserWarning)
+        yield texts
+    texts += dict.fromkeys(str(one.message) for one in caught if issubclass(one.category, UserWarning))
 
 
 def no_memory(what: str, error: MemoryError) -> SimulationError:

@@ -1,8 +1,11 @@
 """Reports of steps and runs: plain records, without Taichi."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field, fields
 
 from taisoft.display import PROBLEMS_SHOWN, percent, run_html
+from taisoft.errors import SimulationError, no_memory
 
 
 @dataclass
@@ -148,6 +151,20 @@ class RunReport:
     pilot_seconds: float = 0.0  #: wall time of the pilots of a run with a tolerance, without compile time [s]
     error_estimate: ErrorEstimate | None = None  #: of a run with error=True or a tolerance
     quantities: dict[str, Quantity] = field(default_factory=dict)  #: of a run with `quantities`, at its end, by name
+
+    def degrade(self, *problems: str) -> None:
+        """Add problems to a run, which is then no longer "ok"."""
+        self.problems += problems
+        self.status = "degraded" if self.status == "ok" else self.status
+
+    @contextmanager
+    def failing(self, what: str) -> Iterator[None]:
+        """Let an error of the block end the run as "failed". what: needs the memory that the system may refuse."""
+        try:
+            yield
+        except (SimulationError, MemoryError) as failure:
+            self.status = "failed"
+            self.problems.append(str(no_memory(what, failure) if isinstance(failure, MemoryError) else failure))
 
     def to_dicts(self) -> list[dict]:
         """Return the rows of steps.csv, which pandas.DataFrame takes."""

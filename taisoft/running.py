@@ -5,13 +5,14 @@ A failure ends the run and is reported; the results so far are kept.
 
 import time
 from collections.abc import Callable
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from taisoft.commanding import refuse_commands
 from taisoft.details import detailed
 from taisoft.dynamics.newton_budget import watched
 from taisoft.energy_check import EnergyCheck
-from taisoft.errors import SimulationError, no_memory
+from taisoft.errors import SimulationError
 from taisoft.estimation.quantities import Definition, definitions, measure_at_end
 from taisoft.frames import ROUNDING, check_length, fit_dt
 from taisoft.records import RunReport, StepReport
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
 FrameCallback = Callable[["Simulator", int, StepReport | None], None]
 StepCallback = Callable[[StepReport, float], None]
 IterationCallback = Callable[[int], None]
+MAXIMA = ("n_inverted", "contact_residual", "max_penetration", "n_contacts", "dropped_contacts", "crossings", "deep")
 LONG_STEP, LOOK_EVERY = 1.0, 0.2  # wall time from which an implicit step is long, and between looks at it [s]
 
 
@@ -48,6 +50,22 @@ class _LongStep:
             raise _StepStopped
         if self._on_iteration is not None:
             self._on_iteration(n)
+
+
+@dataclass
+class RunRequest:
+    """A run as `run` takes it, with checked arguments. measured: its quantities."""
+
+    seconds: float
+    fps: float | None
+    stop: Callable[[], bool] | None = None
+    resumed: bool = False
+    on_frame: FrameCallback | None = None
+    on_step: StepCallback | None = None
+    on_iteration: IterationCallback | None = None
+    error: bool = False
+    error_mesh: "str | Scene | None" = None
+    measured: dict[str, Definition] = field(default_factory=dict)
 
 
 def run(
@@ -93,37 +111,24 @@ def run(
     check_length(seconds, sim.dt, fps)
     measured = definitions(sim, quantities)
     on_step = detailed(sim, details, about, measured, on_step) if details else on_step
-    arguments = {"on_frame": on_frame, "on_step": on_step, "error": error, "error_mesh": error_mesh, "on_iteration": on_iteration}
-    arguments |= {"measured": measured}
+    request = RunRequest(seconds, fps, stop, resumed, on_frame, on_step, on_iteration, error, error_mesh, measured)
     if sim.settings.tolerance is None or resumed:
-        report = run_steps(sim, seconds, fps=fps, stop=stop, resumed=resumed, **arguments)
+        report = run_steps(sim, request)
         if resumed and sim.settings.tolerance is not None:
             report.problems.append("note: the run keeps the steps that were chosen for the tolerance; its error is not estimated")
         return report
     from taisoft.estimation.tolerance import run_to_tolerance
 
     refuse_commands(sim, "tolerance")
-    return run_to_tolerance(sim, run_steps, seconds, fps, stop, **arguments)
+    return run_to_tolerance(sim, request)
 
 
-def run_steps(
-    sim: "Simulator",
-    seconds: float,
-    on_frame: FrameCallback | None = None,
-    fps: float | None = 60,
-    stop: Callable[[], bool] | None = None,
-    resumed: bool = False,
-    on_step: StepCallback | None = None,
-    error: bool = False,
-    error_mesh: "str | Scene | None" = None,
-    on_iteration: IterationCallback | None = None,
-    measured: dict[str, Definition] | None = None,
-) -> RunReport:
-    """Run as `run`, with the simulator's integrator and dt, and checked arguments. measured: its quantities."""
-    report = RunReport()
+def run_steps(sim: "Simulator", request: RunRequest) -> RunReport:
+    """Carry out a run with the simulator's integrator and dt."""
+    report, seconds, resumed, on_frame = RunReport(), request.seconds, request.resumed, request.on_frame
     compiled = sim.compile_seconds
     clock = time.perf_counter()
-    steps_per_frame = fit_dt(sim, fps, report)
+    steps_per_frame = fit_dt(sim, request.fps, report)
     total = max(1, round(seconds / sim.dt))
     if not resumed and seconds < 0.5 * sim.dt:
         report.problems.append(f"note: {seconds:.6g} s are less than half a step: one step of {sim.dt:.6g} s is taken")
@@ -131,29 +136,28 @@ def run_steps(
     elapsed_steps = round(sim.time / sim.dt) if resumed else 0  # steps of this dt since time 0
     first_step = start_count - elapsed_steps
     energy: EnergyCheck | None = None
-    estimator = sim._begin_estimate(total - elapsed_steps, error_mesh, measured or {}) if error else None
+    steps_left = total - elapsed_steps
+    estimator = sim._begin_estimate(steps_left, request.error_mesh, request.measured) if request.error else None
     try:
         try:
-            energy = EnergyCheck(sim)
-            frame, remainder = divmod(elapsed_steps, steps_per_frame)
-            if on_frame is not None and not remainder:
-                on_frame(sim, frame, None)
-            while sim.step_count - first_step < total and not report.interrupted:
-                frame += 1
-                frame_end = min(total, frame * steps_per_frame)
-                merged = _advance_to(sim, first_step + frame_end, stop, on_iteration, report, on_step, energy, estimator)
-                if merged is None:
-                    break
-                if sim.settings.explicit:
-                    report.step_reports.append(merged)
-                if sim.step_count - first_step == frame_end and on_frame is not None:
-                    on_frame(sim, frame, merged)
-        except (SimulationError, MemoryError) as failure:
-            report.status = "failed"
-            report.problems.append(str(no_memory("the next step", failure) if isinstance(failure, MemoryError) else failure))
+            with report.failing("the next step"):
+                energy = EnergyCheck(sim)
+                frame, remainder = divmod(elapsed_steps, steps_per_frame)
+                if on_frame is not None and not remainder:
+                    on_frame(sim, frame, None)
+                while sim.step_count - first_step < total and not report.interrupted:
+                    frame += 1
+                    frame_end = min(total, frame * steps_per_frame)
+                    merged = _advance_to(sim, first_step + frame_end, request, report, energy, estimator)
+                    if merged is None:
+                        break
+                    if sim.settings.explicit:
+                        report.step_reports.append(merged)
+                    if sim.step_count - first_step == frame_end and on_frame is not None:
+                        on_frame(sim, frame, merged)
         except _StepStopped:
             _mark_interrupted(report)
-        measure_at_end(sim, measured or {}, report)
+        measure_at_end(sim, request.measured, report)
         if estimator is not None:
             report.error_estimate = estimator.estimate()
             estimator.set_errors(report.quantities)
@@ -171,34 +175,22 @@ def run_steps(
         energy.add_problem(report)
     end = seconds if resumed else start_time + seconds
     if report.status != "failed" and not report.interrupted and abs(sim.time - end) > (1.0 + ROUNDING) * max(sim.dt, report.dt):
-        report.problems.append(
+        report.degrade(
             f"the run ended at t = {sim.time:.6g} s instead of t = {end:.6g} s, since dt or the state changed during it"
         )
-        report.status = "degraded"
     if report.steps and report.status != "failed":
-        try:
+        with report.failing("the final overlap check"):
             _check_final_overlap(sim, report)
-        except (SimulationError, MemoryError) as failure:
-            report.status = "failed"
-            text = no_memory("the final overlap check", failure) if isinstance(failure, MemoryError) else failure
-            report.problems.append(str(text))
     return report
 
 
 def _mark_interrupted(report: RunReport) -> None:
     report.interrupted = True
-    report.problems.append("the run was interrupted before its end")
+    report.degrade("the run was interrupted before its end")
 
 
 def _advance_to(
-    sim: "Simulator",
-    end: int,
-    stop: Callable[[], bool] | None,
-    on_iteration: IterationCallback | None,
-    report: RunReport,
-    on_step: StepCallback | None,
-    energy: EnergyCheck,
-    estimator: "ErrorEstimator | None",
+    sim: "Simulator", end: int, request: RunRequest, report: RunReport, energy: EnergyCheck, estimator: "ErrorEstimator | None"
 ) -> StepReport | None:
     """Step up to step count `end`. Merge explicit batches into one report; list implicit steps one by one.
 
@@ -206,13 +198,13 @@ def _advance_to(
     """
     merged = None
     while sim.step_count < end:
-        if stop is not None and stop():
+        if request.stop is not None and request.stop():
             _mark_interrupted(report)
             break
         energy.before_step()
         until = end if estimator is None else estimator.next_comparison(end)
-        with watched(_LongStep(stop, on_iteration)):
-            latest = timed_advance(sim, until - sim.step_count, on_step)
+        with watched(_LongStep(request.stop, request.on_iteration)):
+            latest = timed_advance(sim, until - sim.step_count, request.on_step)
         energy.after_step(latest)
         if estimator is not None and sim.step_count == until:
             estimator.compare()
@@ -234,16 +226,12 @@ def timed_advance(sim: "Simulator", n: int, on_step: StepCallback | None) -> Ste
 
 
 def _merge(a: StepReport, b: StepReport) -> StepReport:
-    """Merge two reports of explicit steps into the later one, b: extremes and sums of both, the rest from b."""
+    """Merge two reports of explicit steps into the later one, b: extremes (MAXIMA) and sums of both, the rest from b."""
     b.steps += a.steps
     b.min_volume_ratio = min(a.min_volume_ratio, b.min_volume_ratio)
-    b.n_inverted = max(a.n_inverted, b.n_inverted)
     b.contact_iterations += a.contact_iterations
-    b.contact_residual = max(a.contact_residual, b.contact_residual)
-    b.max_penetration = max(a.max_penetration, b.max_penetration)
-    b.n_contacts = max(a.n_contacts, b.n_contacts)
-    b.dropped_contacts = max(a.dropped_contacts, b.dropped_contacts)
-    b.crossings, b.deep = max(a.crossings, b.crossings), max(a.deep, b.deep)
+    for name in MAXIMA:
+        setattr(b, name, max(getattr(a, name), getattr(b, name)))
     b.contact_error = b.contact_error or a.contact_error
     b.converged = a.converged and b.converged
     b.problems = a.problems + b.problems
@@ -256,43 +244,35 @@ def _check_final_overlap(sim: "Simulator", report: RunReport) -> None:
     beyond, worst = max(((o.depth / sim.contact_limit(o.name_a, o.name_b), k) for k, o in enumerate(found)), default=(0.0, 0))
     if beyond > 1.0:
         found = found[worst]
-        report.problems.append(f"at the end '{found.name_a}' and '{found.name_b}' overlap by {found.depth:.3g} m")
-        report.status = "degraded"
+        report.degrade(f"at the end '{found.name_a}' and '{found.name_b}' overlap by {found.depth:.3g} m")
 
 
 def _summarize_steps(report: RunReport) -> None:
     """Add problems and the status: any step that dropped contacts, inverted tets or did not converge degrades the run."""
     steps = report.step_reports
-    unconverged = [s for s in steps if not s.converged]
-    inverted = [s for s in steps if s.n_inverted > 0]
-    if unconverged:
+    if unconverged := [s for s in steps if not s.converged]:
         worst = max(unconverged, key=lambda s: max(s.residual, s.contact_residual))
-        report.problems.append(
+        report.degrade(
             f"{len(unconverged)} of {len(steps)} steps did not converge; the worst, at t = {worst.time:.4g} s, "
             f"reached a relative residual of {worst.residual:.2e}"
             + (f" and a contact residual of {worst.contact_residual:.2e}" if worst.n_contacts else "")
         )
-    if inverted:
+    if inverted := [s for s in steps if s.n_inverted > 0]:
         worst = max(inverted, key=lambda s: s.n_inverted)
-        report.problems.append(
+        report.degrade(
             f"tets were inverted in {len(inverted)} reported steps; at most {worst.n_inverted}, at t = {worst.time:.4g} s"
         )
-    dropped = [s for s in steps if s.dropped_contacts > 0]
-    if dropped:
-        report.problems.append(f"in {len(dropped)} of {len(steps)} reported steps contacts of inverted tets were unknown")
-    deep = [s for s in steps if s.deep]
-    if deep:
+    if dropped := [s for s in steps if s.dropped_contacts > 0]:
+        report.degrade(f"in {len(dropped)} of {len(steps)} reported steps contacts of inverted tets were unknown")
+    if deep := [s for s in steps if s.deep]:
         worst, crossings = max(deep, key=lambda s: s.max_penetration), max(s.crossings for s in deep)
-        report.problems.append(
+        report.degrade(
             f"in {len(deep)} of {len(steps)} reported steps bodies penetrate; the worst, at t = {worst.time:.4g} s, "
             f"by {worst.max_penetration:.3g} m" + (f", with up to {crossings} crossing pairs of triangles" if crossings else "")
         )
-    inexact = [s for s in steps if s.contact_error]
-    if inexact:
+    if inexact := [s for s in steps if s.contact_error]:
         worst = max(inexact, key=lambda s: s.misplaced)
-        report.problems.append(
+        report.degrade(
             f"in {len(inexact)} of {len(steps)} reported steps contacts are inexact; at worst, at t = {worst.time:.4g} s, "
             f"{worst.contact_error}"
         )
-    if report.status == "ok" and (unconverged or inverted or dropped or deep or inexact or report.interrupted):
-        report.status = "degraded"

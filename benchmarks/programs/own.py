@@ -4,11 +4,11 @@ import numpy as np
 
 import taisoft as ts
 from taisoft.scene.scene import Scene
-from taisoft.study.measure import TimedRun, advance
 
 from ..elasticity_runs import lasting_steps
 from ..exact_path import DENSITY, POISSON, SAMPLE
 from ..runner import warm_up, without_warnings
+from ..timed_run import TimedRun, advance
 from ..works.references import MUJOCO, TAISOFT, Model
 from ..works.scenes import Work
 from .session import Session, Setting

@@ -11,10 +11,10 @@ import numpy as np
 
 import taisoft as ts
 from taisoft.errors import SimulationError
-from taisoft.study.measure import advance
 
 from ..document import exponent, table
 from ..runner import without_warnings
+from ..timed_run import advance
 from .page import COLOURS, Claim, Extent, Part, is_near, new_figure, plot_png
 
 EXPLICIT, IMPLICIT = "symplectic_euler", "implicit_euler"

@@ -9,7 +9,7 @@ import numpy as np
 
 from taisoft.errors import TaisoftError
 from taisoft.machine import Timing, summarise
-from taisoft.study.results import cheapest
+from taisoft.study.results import front
 
 from ..elasticity_runs import TAISOFT as OWN
 from ..elasticity_runs import repeat_short
@@ -126,8 +126,8 @@ def _round(row: Row, program: ModuleType) -> np.ndarray | None:
 def fastest_within(rows: list[Row], error: float) -> Row | None:
     """The fastest of these rows with at most this error."""
     timed = [row for row in rows if row.timing is not None]
-    found = cheapest([(row.timing.median, row.claimed) for row in timed], error)
-    return None if found is None else timed[found]
+    best = (timed[k] for k in front([(row.timing.median, row.claimed) for row in timed]))
+    return next((row for row in best if row.claimed <= error), None)
 
 
 def fastest_standing(rows: list[Row]) -> Row | None:

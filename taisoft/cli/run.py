@@ -96,9 +96,13 @@ def run(arguments: Namespace) -> int:
             settings = resolve(solver, arguments, Simulator, kept)
             if "dt" in settings.changed and saved.settings.get("tolerance") is not None:
                 raise SceneError(f"--resume {arguments.resume}: its dt was chosen for a tolerance and cannot change in a run")
-            sim = _resumed(saved, scene, settings)
+            sim = Simulator.from_checkpoint(saved, scene, arch=settings.simulator["arch"])
         settings.numbers = numbers
         with sim:
+            if "dt" in settings.changed:
+                sim.dt = settings.simulator["dt"]
+            if saved is not None:
+                print(f"resumed  from {saved.path}, t = {sim.time:.6g} s")
             check_modelled(shown, sim)
             print_plan(sim, arguments.verbose)
             if interactive:
@@ -218,19 +222,6 @@ def _check_tolerance(settings: RunSettings, interactive: bool) -> None:
         raise SceneError("--tolerance needs frames at a rate, not after every step: give --fps")
 
 
-def _resumed(saved: Checkpoint, scene: Scene, settings: RunSettings) -> Simulator:
-    """Return the resumed simulator, with another dt if requested."""
-    sim = Simulator.from_checkpoint(saved, scene, arch=settings.simulator["arch"])
-    if "dt" in settings.changed:
-        try:
-            sim.dt = settings.simulator["dt"]
-        except BaseException:
-            sim.close()
-            raise
-    print(f"resumed  from {saved.path}, t = {sim.time:.6g} s")
-    return sim
-
-
 def _check_time_left(sim: Simulator, settings: RunSettings, arguments: Namespace) -> None:
     """Raise SceneError if the checkpoint is already at the end of the run."""
     if arguments.resume is not None and settings.seconds - sim.time < 0.5 * sim.dt:
@@ -332,7 +323,6 @@ def _run(sim, settings: RunSettings, arguments, signals, warned: list[str], save
 
 def _report_failed_output(result: RunReport, observers: Observers, signals: Signals) -> None:
     """Add all output errors to the run's report: report.json may still fit on the disk when a picture did not."""
-    result.problems += [error for error in observers.errors if error not in result.problems]
     if observers.errors:
+        result.degrade(*(error for error in observers.errors if error not in result.problems))
         result.interrupted = result.interrupted and signals.requested()
-        result.status = "degraded" if result.status == "ok" else result.status

@@ -131,7 +131,7 @@ def answer(request: dict) -> dict:
     """Answer {"action": "plan" or "run", ...} in the child process: {"answer": plan or record} or {"error": sentence}."""
     from taisoft.scene.fingerprint import scene_digest
     from taisoft.study.measure import measure
-    from taisoft.study.plan import make_plan
+    from taisoft.study.plan import Planner
 
     scenes: dict[str, str] = {}  # digest of each variant that was loaded
     name, allow_outside = request["scene"], request["allow_outside"]
@@ -145,7 +145,7 @@ def answer(request: dict) -> dict:
         if request["action"] == "plan":
             _, solver = load_scene(name, allow_outside, refine=0)
             check_scene_solver(solver)
-            plan = make_plan(variant, solver, request["request"])
+            plan = Planner(variant, solver, request["request"]).plan()
             # include the files' content: nothing else distinguishes paths that are functions
             return {"answer": plan | {"scenes": scenes, "sources": sources(find_scene(name)), "code": code_digest()}}
         if code_digest() != request["code"]:

@@ -3,12 +3,11 @@
 import textwrap
 
 from taisoft.cli.recording import Observers, Recording
-from taisoft.display import percent
+from taisoft.display import PROBLEMS_SHOWN, percent
 from taisoft.frames import dt_sentence
 from taisoft.records import ERROR_KINDS, ErrorEstimate, RunReport
 
 WIDTH = 118  # of the terminal
-PROBLEMS_SHOWN = 5
 KINDS = ("problem", "warning", "note")  # of entries of RunReport.problems, the most important first
 MOST = 0.5  # fraction of a run's wall time above which the summary says what pictures cost
 

@@ -4,6 +4,8 @@ Its times are those of one core (`taisoft bench scaling`, `taisoft bench toleran
 explicit and implicit steps compete.
 """
 
+from collections.abc import Callable
+
 from taisoft.records import StepReport
 from taisoft.scene.scene import Scene
 
@@ -46,22 +48,21 @@ def implicit_step(scene: Scene, touches: bool, counts: list[float] | None = None
 
 
 class Spent(Exception):
-    """A `Budget` is spent."""
+    """A `budget` is spent."""
 
 
-class Budget:
-    """Ends a pilot of implicit steps that cost more on average than a limit [us]. Pass `add` to its run as on_step.
+def budget(scene: Scene, touches: bool, limit: float, steps: float) -> Callable[[StepReport, float], None]:
+    """Return an `on_step` of a pilot of implicit steps that raises Spent if they cost more on average than a limit [us].
 
     steps: of the pilot. They may cost the limit times their number, or times the part SHOWN of all of them if that is more.
     """
+    cost, taken = 0.0, 0  # [us], steps
 
-    def __init__(self, scene: Scene, touches: bool, limit: float, steps: float):
-        self._scene, self._touches, self._limit, self._steps = scene, touches, limit, steps
-        self._cost, self._taken = 0.0, 0  # [us], steps
-
-    def add(self, report: StepReport, _seconds: float) -> None:
-        """Count a step. Raises Spent if the limit is exceeded."""
-        self._cost += implicit_step(self._scene, self._touches, [getattr(report, name) for name in COUNTS])
-        self._taken += 1
-        if self._cost > self._limit * max(self._taken, SHOWN * self._steps):
+    def add(report: StepReport, _seconds: float) -> None:
+        nonlocal cost, taken
+        cost += implicit_step(scene, touches, [getattr(report, name) for name in COUNTS])
+        taken += 1
+        if cost > limit * max(taken, SHOWN * steps):
             raise Spent
+
+    return add

@@ -14,17 +14,16 @@ is not seen. Rounding is not estimated.
 
 import dataclasses
 import time
-import warnings
-from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from taisoft.dynamics.schemes import SECOND_ORDER
+from taisoft.errors import collected_warnings
 from taisoft.estimation import quantities
 from taisoft.estimation.comparison import Differences
 from taisoft.estimation.order import MESH_ORDER, MIN_ORDER, agreement, error_over_difference, nominal_order, observed_order
-from taisoft.estimation.twins import TIGHTER, Twin, larger_steps, on_mesh, smaller_steps, tighter
+from taisoft.estimation.twins import TIGHTER, Twin, on_mesh, other_steps, tighter
 from taisoft.ranges import owners
 from taisoft.records import BodyError, Energies, ErrorEstimate, Quantity
 from taisoft.scene.rigid import RigidBody
@@ -33,7 +32,6 @@ from taisoft.scene.scene import Scene
 if TYPE_CHECKING:
     from taisoft.simulator import Simulator
 
-MIN_STEPS = 32  # of a run whose error is estimated by larger steps
 SOLVER_ORDER = 1  # errors are about proportional to the tolerances
 SOLVER_FACTOR = error_over_difference(TIGHTER, SOLVER_ORDER)
 PARTED = 0.1  # with one twin: difference, over the excursion, above which paths may have parted for good
@@ -53,6 +51,7 @@ class ErrorEstimator:
         self._sim, self._first, self._given = sim, sim.step_count, (sim._host().changes, sim.dt)
         self._changed = ""
         self._twins: list[Twin] = []
+        self._others: dict[str, tuple[Twin, np.ndarray]] = {}  # of solver and mesh, and errors over differences (n_bodies,)
         self._differences: dict[Twin, Differences] = {}
         self.times: list[float] = []
         self._made: ErrorEstimate | None = None  # since the last comparison
@@ -65,8 +64,7 @@ class ErrorEstimator:
         self._energies = np.zeros(4)  # differences to the first twin at the last comparison [J]
         self._means: list[list[np.ndarray]] = []  # per comparison: mean positions of the bodies, of the run and of the first twin
         try:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore", UserWarning)  # the run has given them
+            with collected_warnings():  # the run has given them
                 self._make_twins(steps, mesh)
         except BaseException:
             self.close()
@@ -76,19 +74,18 @@ class ErrorEstimator:
     def _make_twins(self, steps: int, mesh: str | Scene | None) -> None:
         """Make the twins: first that on another mesh, since it may be refused, then those of other steps and tolerances."""
         sim = self._sim
-        self._space = None
+        of_mesh = {}
         if mesh is not None:
             twin, ratios = on_mesh(sim, mesh)
-            self._space = self._add(twin)  # with another order the error is the difference itself
             soft = [ratio for body, ratio in zip(sim.scene.bodies, ratios) if not isinstance(body, RigidBody)]
             nearest = min((abs(np.log(ratio or 1.0)), ratio) for ratio in soft)[1] if soft else None  # to 1: the largest error
             self._width = nearest and [nearest]
-            self._space_factors = np.array([error_over_difference(r, MESH_ORDER) if r else 1.0 for r in ratios])
-        self._in_time = [self._add(twin) for twin in larger_steps(sim)] if steps >= MIN_STEPS else []
-        if not self._in_time:
-            self._in_time.append(self._add(smaller_steps(sim)))
+            factors = [error_over_difference(r, MESH_ORDER) if r else 1.0 for r in ratios]  # 1: the order differs, not the width
+            of_mesh = {"space": (self._add(twin), np.array(factors))}
+        self._in_time = [self._add(twin) for twin in other_steps(sim, steps)]
         tight = tighter(sim)
-        self._solver = None if tight is None else self._add(tight)
+        of_solver = {} if tight is None else {"solver": (self._add(tight), np.full(len(self._sizes), SOLVER_FACTOR))}
+        self._others = of_solver | of_mesh
         self._stride = max(twin.per for twin in self._in_time)
         if len(self._in_time) > 1:
             self._between = Differences(self._bodies)  # of the two twins
@@ -98,13 +95,6 @@ class ErrorEstimator:
         self._twins.append(twin)
         self._differences[twin] = Differences(self._bodies[twin.own])
         return twin
-
-    def _others(self) -> Iterator[tuple[str, Twin, np.ndarray]]:
-        """The twins of solvers and mesh: the kind of error, twin, and errors over the differences to it, per body (n_bodies,)."""
-        if self._solver is not None:
-            yield "solver", self._solver, np.full(len(self._sizes), SOLVER_FACTOR)
-        if self._space is not None:
-            yield "space", self._space, self._space_factors
 
     def next_comparison(self, end: int) -> int:
         """The step count at which to call `compare` before `end`, or else `end` itself."""
@@ -121,8 +111,7 @@ class ErrorEstimator:
             self._made = None  # an estimate read before the change
             return
         begin, compiled = time.perf_counter(), self._sim.compile_seconds
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)  # of twins, not of the run
+        with collected_warnings():  # of twins, not of the run
             for twin in self._twins:
                 twin.follow(steps)
         self._compare()
@@ -163,7 +152,7 @@ class ErrorEstimator:
         factor = self._time_factor(count)[0] if 0 < count == len(self.times) else None
         if factor is None:
             return np.full(len(found), np.nan)
-        for _, twin, scales in (("time", self._in_time[0], np.full(len(self._sizes), factor)), *self._others()):
+        for twin, scales in ((self._in_time[0], np.full(len(self._sizes), factor)), *self._others.values()):
             errors = np.full(len(found), np.nan)
             if not twin.failed:
                 errors[twin.own] = scales[self._bodies[twin.own]] * self._differences[twin].map
@@ -211,11 +200,11 @@ class ErrorEstimator:
         settings, levels = self._sim.settings, {}
         nominal = nominal_order(settings.integrator, self._sim.scene, self._sim.touches)
         most = 2.0 if settings.integrator in SECOND_ORDER else 1.0
-        if self._solver is not None:
-            levels["solver"] = [self._solver], [TIGHTER], SOLVER_ORDER, SOLVER_ORDER
+        if "solver" in self._others:
+            levels["solver"] = [self._others["solver"][0]], [TIGHTER], SOLVER_ORDER, SOLVER_ORDER
         levels["time"] = self._in_time, [twin.ratio for twin in self._in_time], nominal, most
-        if self._space is not None:
-            levels["space"] = [self._space], self._width, quantities.MESH_ORDER, quantities.MESH_ORDER
+        if "space" in self._others:
+            levels["space"] = [self._others["space"][0]], self._width, quantities.MESH_ORDER, quantities.MESH_ORDER
         self._samples.set_errors(found, levels, self._sim.time, self._rounding)
 
     def _estimate_all(self, changed: str) -> ErrorEstimate:
@@ -228,9 +217,9 @@ class ErrorEstimator:
             made.notes.append(f"the errors are unknown: {why}")
         else:
             self._estimate_time(made)
-            for kind, twin, factors in self._others():
+            for kind, (twin, factors) in self._others.items():
                 self._estimate(made, kind, twin, factors)
-            if self._solver is None:
+            if "solver" not in self._others:
                 made.solver = 0.0  # nothing is solved
         made.twins = [twin.what for twin in self._twins]
         return made

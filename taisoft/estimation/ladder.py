@@ -86,28 +86,22 @@ class Ladder:
         if len(self.pilots) < 2:
             return
         before, last = self.pilots[-2:]
-        excursion, ratio = self.excursion(last), float(last.per_frame / before.per_frame)
-        self.differences = self._last_differences()
+        pairs = itertools.pairwise(self.pilots[-4:])
+        self.differences = [float(np.sqrt(np.mean(distances(fine, coarse) ** 2))) for coarse, fine in pairs]
         self.order = self._observed_order()
         self.unsure = UNSURE / SAFETY if self.are_few else self._measured
-        apart = float(distances(last, before).max())
-        self.error = apart * self.error_over_difference(ratio) / excursion if excursion else 0.0
+        ratio = float(last.per_frame / before.per_frame)
+        self._set_error(last, float(distances(last, before).max()) * self.error_over_difference(ratio))
 
     @property
     def _measured(self) -> float:
         """`unsure` of a measured error: of sudden motion it is assumed to fall as slowly as it may, unless pilots show more."""
         return 1.0 if self.sudden and (self.order or 1.0) <= 1.0 else 1.0 / SAFETY
 
-    def _last_differences(self) -> list[float]:
-        """The last `differences`, as many as are needed."""
-        pairs = itertools.pairwise(self.pilots[-4:])
-        return [float(np.sqrt(np.mean(distances(pilot, before) ** 2))) for before, pilot in pairs]
-
     def expect(self) -> None:
         """Expect the error of the only pilot, explicit, from its velocities alone."""
         pilot, self.unsure = self.pilots[0], (UNSURE if self.sudden else 1.0) / SAFETY
-        excursion = self.excursion(pilot)
-        self.error = self._expected_error(pilot, excursion) if excursion else 0.0
+        self._set_error(pilot, self._expected_error(pilot))
 
     @property
     def is_of_first_order(self) -> bool:
@@ -125,7 +119,6 @@ class Ladder:
         if any(part is not None and part.report.status == "failed" for part in (hardest, fastest)):
             self.error = None
         elif self.error:
-            excursion = self.excursion(pilot)
             if fastest is not None:
                 of_changes = self._shown(pilot, hardest, 2) * pilot.parts[HARDEST].times
                 shown = max(of_changes, self._shown(pilot, fastest, 1) * pilot.parts[FASTEST].times)
@@ -133,7 +126,7 @@ class Ladder:
                 times = 1.0 if self.sudden else pilot.parts[HARDEST].times
                 times = self.frames.count / self.frames.part if self.is_of_first_order else times
                 shown = self._shown(pilot, hardest, self.nominal) * times
-            self.error = max(self._expected_error(pilot, excursion), shown / excursion)
+            self._set_error(pilot, max(self._expected_error(pilot), shown))
 
     def replace_first(self, pilot: Pilot) -> None:
         """Replace the first pilot, explicit, by one with a slightly smaller step, and expect its error."""
@@ -141,11 +134,9 @@ class Ladder:
         if pilot.report.status == "failed":
             return
         before, self.pilots, self.unsure = self.pilots, [pilot], self._measured
-        excursion = self.excursion(pilot)
-        if excursion == 0.0:
-            self.error = 0.0
-        elif before:
-            self.error = max(self._expected_error(pilot, excursion), self._shown(pilot, before[0], self.nominal) / excursion)
+        if before or not self.excursion(pilot):
+            shown = self._shown(pilot, before[0], self.nominal) if before else 0.0
+            self._set_error(pilot, max(self._expected_error(pilot), shown))
 
     @staticmethod
     def _shown(pilot: Pilot, other: Pilot, order: int) -> float:
@@ -170,6 +161,11 @@ class Ladder:
         found = pilot.excursion
         return found if found > self.frames.negligible else 0.0
 
+    def _set_error(self, pilot: Pilot, distance: float) -> None:
+        """Set the error of a pilot [m], over the excursion."""
+        excursion = self.excursion(pilot)
+        self.error = distance / excursion if excursion else 0.0
+
     def _observed_order(self) -> float | None:
         """Order of the last three pilots; None if they show none."""
         if len(self.differences) < 2:
@@ -187,12 +183,12 @@ class Ladder:
         shows = self.impacts and self.integrator == EXPLICIT and order < SMOOTH_ORDER
         return min(order, IMPACT_ORDER if shows else 1.0)
 
-    def _expected_error(self, pilot: Pilot, excursion: float) -> float:
-        """Error of an explicit pilot, over the excursion, from its velocities; see above."""
+    def _expected_error(self, pilot: Pilot) -> float:
+        """Error of an explicit pilot [m], from its velocities; see above."""
         frame = self.frames.seconds
         dt = frame / float(pilot.per_frame)
         error = dt * dt / 24.0 * (float(np.max(pilot.variations)) + 2.0 * pilot.jump) / frame
-        return (max(error, IMPACT * dt * pilot.jump) if self.sudden else DISPERSION * error) / excursion
+        return max(error, IMPACT * dt * pilot.jump) if self.sudden else DISPERSION * error
 
     @property
     def diverges(self) -> bool:

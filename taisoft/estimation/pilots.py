@@ -7,7 +7,6 @@ there for a small part of the cost.
 """
 
 import math
-import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
@@ -16,10 +15,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from taisoft.errors import collected_warnings
 from taisoft.estimation.comparison import largest_excursion
 from taisoft.estimation.costs import COUNTS
 from taisoft.ranges import owners
-from taisoft.records import RunReport, StepReport
+from taisoft.records import RunReport
+from taisoft.running import RunRequest, StepCallback, run_steps
 
 if TYPE_CHECKING:
     from taisoft.simulator import Simulator
@@ -28,13 +29,8 @@ NEGLIGIBLE = {"f32": 1e-6, "f64": 1e-12}  # excursions, over the size of the sce
 ROUNDING = 1e-6  # part of a frame that a run's length may lack of a whole one
 MAX_FRAMES = 48  # at which paths are recorded
 PARTS = 24  # of a run, about; a pilot knows which is the hardest
-BLOCK = 64  # frames whose velocities are held until their changes are added
-HELD_NODES = 100_000  # nodes of all states at ends of parts that are held until then: 5 to 10 MB
 MAX_NODES = 4096  # whose paths are recorded, evenly spread
 HARDEST, FASTEST = "hardest", "fastest"  # parts: of the largest changes of velocities, and of the largest velocities
-
-RunFunction = Callable[..., RunReport]  # as `running.run_steps`
-StepCallback = Callable[[StepReport, float], None]  # its on_step
 
 
 @dataclass(frozen=True)
@@ -50,15 +46,14 @@ class Part:
 class Pilot:
     """A pilot, or the run itself. per_frame: its steps in the time of a frame.
 
-    frames: numbers (k,) of the recorded ones; positions: of the recorded nodes at these (k,n,3) [m]; variations: (n,) sums of the
-    changes, from frame to frame, of what velocities change in a frame; jump: the largest such change of velocity [m/s]; end: the
-    simulation's state at the end; parts: the hardest one, or also the fastest one; warned: texts of warnings.
+    positions: of the recorded nodes (n,3) [m], by the numbers of the recorded frames; variations: (n,) sums of the changes, from
+    frame to frame, of what velocities change in a frame; jump: the largest such change of velocity [m/s]; end: the simulation's
+    state at the end; parts: the hardest one, or also the fastest one; warned: texts of warnings.
     """
 
     integrator: str
     per_frame: Fraction
-    frames: list[int] = field(default_factory=list)
-    positions: list[np.ndarray] = field(default_factory=list)
+    positions: dict[int, np.ndarray] = field(default_factory=dict)
     variations: np.ndarray | float = 0.0
     jump: float = 0.0
     report: RunReport = field(default_factory=RunReport)
@@ -76,14 +71,10 @@ class Pilot:
         """Whether anything touches in a step."""
         return any(report.n_contacts for report in self.report.step_reports)
 
-    def at(self, frames: list[int]) -> np.ndarray:
-        """Positions at some of the frames (k,n,3) [m]."""
-        return np.array([self.positions[self.frames.index(k)] for k in frames])
-
     @property
     def excursion(self) -> float:
         """The largest excursion [m]."""
-        return largest_excursion(np.array(self.positions))
+        return largest_excursion(np.array(list(self.positions.values())))
 
 
 class Recorder:
@@ -97,9 +88,8 @@ class Recorder:
         self._pilot, self._frames, self._first, self._keeps = pilot, frames, first, keeps
         self._stride = stride if stride.denominator > 1 else int(stride)
         self._index: int | None = None  # of the first frame
-        self._velocities: list[np.ndarray] = []  # since the frame up to which changes are added, with that one
-        self._ends: list[tuple[int, int, dict]] = []  # of parts since then: changes before it, its frame, and the state there
-        self._jump: np.ndarray | None = None  # the change of velocities there
+        self._velocities: np.ndarray | None = None  # (n,3) at the frame before
+        self._jump: np.ndarray | None = None  # (n,3) the change of velocities to that one
         self._part: Part | None = None  # the present one
         self._sums: dict[str, np.ndarray | float] = dict.fromkeys(keeps, 0.0)  # (n,) in it, of what distinguishes parts
         self._most, self._total = dict.fromkeys(keeps, -1.0), dict.fromkeys(keeps, 0.0)  # of the largest ones: in a part, in all
@@ -113,43 +103,26 @@ class Recorder:
         number, state = int(number), sim._dynamics.state
         if frames.is_recorded(number):
             x, v = state.state()
-            pilot.frames.append(number)
-            pilot.positions.append(x[frames.nodes].astype(np.float64))
+            pilot.positions[number] = x[frames.nodes].astype(np.float64)
         else:
             v = state.velocities()
-        self._velocities.append(np.ascontiguousarray(v[frames.nodes]))  # a view would hold the velocities of all nodes
+        self._add_changes(v[frames.nodes].astype(np.float64))
         if self._keeps and (number % frames.part == 0 or number == frames.count):
-            kept = sim._dynamics.snapshot() if number < frames.count else {}
-            self._ends.append((len(self._velocities) - 1, number, kept))
-        if len(self._velocities) > BLOCK or len(self._ends) * len(v) > HELD_NODES:
-            self.add_changes()
+            self._end_part(number, sim._dynamics.snapshot() if number < frames.count else {})
 
-    def add_changes(self) -> None:
-        """Add the changes of the velocities that were recorded since the last call."""
-        pilot, velocities = self._pilot, np.array(self._velocities, np.float64)
-        if len(velocities) < 2:
-            return
-        jumps = np.diff(velocities, axis=0)
-        lengths = _lengths(jumps)
-        pilot.jump = max(pilot.jump, float(lengths.max()))
-        if self._jump is None:
-            changes = np.concatenate([lengths[:1], _lengths(np.diff(jumps, axis=0))])
-            pilot.variations = changes[1:].sum(axis=0)
-        else:
-            changes = _lengths(np.diff(np.concatenate([self._jump[None], jumps]), axis=0))
-            pilot.variations = pilot.variations + changes.sum(axis=0)
-        self._add_to_parts({name: changes if name == HARDEST else _lengths(velocities[1:]) for name in self._keeps})
-        self._velocities, self._ends, self._jump = self._velocities[-1:], [], jumps[-1]
-
-    def _add_to_parts(self, found: dict[str, np.ndarray]) -> None:
-        """Add what distinguishes parts (k,n) at the frames since the last call."""
-        begin = 0
-        for end, number, state in [*self._ends, (None, 0, {})]:
-            for name, one in found.items():
-                self._sums[name] = self._sums[name] + one[begin:end].sum(axis=0)
-            if end is not None:
-                self._end_part(number, state)
-                begin = end
+    def _add_changes(self, velocities: np.ndarray) -> None:
+        """Add the changes to the velocities (n,3) [m/s] of the next frame."""
+        pilot = self._pilot
+        if self._velocities is not None:
+            jump = velocities - self._velocities
+            lengths = _lengths(jump)
+            pilot.jump = max(pilot.jump, float(lengths.max()))
+            changes = lengths if self._jump is None else _lengths(jump - self._jump)
+            pilot.variations = pilot.variations + (0.0 if self._jump is None else changes)
+            for name in self._keeps:
+                self._sums[name] = self._sums[name] + (changes if name == HARDEST else _lengths(velocities))
+            self._jump = jump
+        self._velocities = velocities
 
     def _end_part(self, number: int, state: dict) -> None:
         """End a part of the run, and begin the next one at a frame, with the state there; at the end of the run it is empty."""
@@ -202,7 +175,6 @@ class Frames:
         sim: "Simulator",
         per_frame: Fraction,
         stop: Callable[[], bool] | None,
-        run: RunFunction,
         part: Part | None = None,
         keeps: tuple[str, ...] = (),
         on_step: StepCallback | None = None,
@@ -210,7 +182,7 @@ class Frames:
         """Run a pilot of `per_frame` steps a frame; its report has the status "failed" if it fails. Restores sim's state.
 
         part: of another pilot, which alone is to be run; keeps: own parts before which to keep the state; stop, on_step: as for
-        `run`.
+        `Simulator.run`.
         """
         pilot = Pilot(sim.settings.integrator, per_frame)
         kept, may_soften = sim._dynamics.snapshot(), sim._may_soften
@@ -222,14 +194,12 @@ class Frames:
         try:
             if part is not None:
                 sim._dynamics.restore(part.state)
-            with warnings.catch_warnings(record=True) as caught:
-                warnings.simplefilter("always")  # they are those of the run only if the pilot is
+            with collected_warnings() as pilot.warned:  # which the run has only if the pilot is the run
                 sim.dt = self.seconds / float(per_frame)
                 recorder = Recorder(pilot, self, Fraction(stride), first, keeps)
-                pilot.report = run(sim, length, recorder.frame, 1.0 / (self.seconds * stride), stop, on_step=on_step)
-                recorder.add_changes()
+                request = RunRequest(length, 1.0 / (self.seconds * stride), stop, on_frame=recorder.frame, on_step=on_step)
+                pilot.report = run_steps(sim, request)
             pilot.end = sim._dynamics.snapshot()
-            pilot.warned = list(dict.fromkeys(str(one.message) for one in caught if issubclass(one.category, UserWarning)))
         finally:
             sim._dynamics.restore(kept)
             sim._may_soften = may_soften
@@ -247,10 +217,10 @@ def make_frames(sim: "Simulator", length: float, seconds: float) -> Frames:
 
 def distances(pilot: Pilot, other: Pilot) -> np.ndarray:
     """Distances of two pilots' nodes at their common frames (k,n) [m]."""
-    common = [frame for frame in pilot.frames if frame in set(other.frames)]
-    return np.linalg.norm(pilot.at(common) - other.at(common), axis=2)
+    common = [frame for frame in pilot.positions if frame in other.positions]
+    return np.linalg.norm([pilot.positions[frame] - other.positions[frame] for frame in common], axis=2)
 
 
 def _lengths(vectors: np.ndarray) -> np.ndarray:
-    """Lengths (k,n) of vectors (k,n,3)."""
-    return np.sqrt(np.einsum("kij,kij->ki", vectors, vectors))
+    """Lengths (n,) of vectors (n,3)."""
+    return np.sqrt(np.einsum("ij,ij->i", vectors, vectors))

@@ -64,8 +64,7 @@ def measure_at_end(sim: "Simulator", measured: dict[str, Definition], report: Ru
         report.quantities[name] = Quantity(value=value, unit=definition.unit)
         if reason:
             report.quantities[name].notes.append(f"the value of {name!r} is unknown: {reason}")
-            report.problems += report.quantities[name].notes
-            report.status = "degraded" if report.status == "ok" else report.status
+            report.degrade(*report.quantities[name].notes)
         if unsolved := sum(not one.converged for one in report.step_reports):
             report.quantities[name].notes.append(f"steps of the run did not converge ({unsolved}): no error tells what that does")
 

@@ -18,19 +18,20 @@ Weak: pilots do not show what is faster than all of them (`vibrations`). Where t
 import math
 import time
 import warnings
-from collections.abc import Callable
+from dataclasses import replace
 from fractions import Fraction
 from typing import TYPE_CHECKING
 
-from taisoft.errors import SimulationError, no_memory
-from taisoft.estimation.costs import Budget, Spent, explicit_step, implicit_step
+from taisoft.errors import SimulationError, collected_warnings
+from taisoft.estimation.costs import Spent, budget, explicit_step, implicit_step
 from taisoft.estimation.first_choice import EXPLICIT, IMPLICIT, stable_steps
 from taisoft.estimation.ladder import SMALLER, Ladder, implicit_sizes, slightly_more
 from taisoft.estimation.order import is_smooth, may_jump, nominal_order
-from taisoft.estimation.pilots import FASTEST, HARDEST, Part, Pilot, Recorder, RunFunction, StepCallback, distances, make_frames
+from taisoft.estimation.pilots import FASTEST, HARDEST, Part, Pilot, Recorder, distances, make_frames
 from taisoft.estimation.vibrations import ERROR as VIBRATIONS
 from taisoft.estimation.vibrations import add_vibrations, are_passed_over
 from taisoft.records import BodyError, ErrorEstimate, RunReport
+from taisoft.running import RunRequest, run_steps
 from taisoft.scene.scene import Scene
 from taisoft.stability import stable_dt
 
@@ -46,34 +47,30 @@ class Stopped(Exception):
     """`stop` ended a pilot."""
 
 
-def run_to_tolerance(
-    sim: "Simulator", run: RunFunction, seconds: float, fps: float | None, stop: Callable[[], bool] | None, **observers
-) -> RunReport:
-    """Run a simulator with a tolerance by `run` (`running.run_steps`). observers: further arguments of it.
+def run_to_tolerance(sim: "Simulator", request: RunRequest) -> RunReport:
+    """Carry out a run of a simulator with a tolerance.
 
     Raises SimulationError while a body is dragged, and for a mesh that errors cannot be estimated with.
     """
-    _check_run(sim, observers.get("error_mesh"))
+    _check_run(sim, request.error_mesh)
     report, clock, compiled = RunReport(), time.perf_counter(), sim.compile_seconds
-    chooser = Chooser(sim, run, seconds, fps, stop)
+    chooser = Chooser(sim, request)
     try:
-        steps = chooser.choose()
+        with report.failing("the pilots"):
+            steps = chooser.choose()
     except Stopped:
-        report.interrupted, report.status = True, "degraded"
-        report.problems.append("the run was interrupted during its pilots: nothing was simulated")
-    except (SimulationError, MemoryError) as failure:
-        report.status = "failed"
-        report.problems.append(str(no_memory("the pilots", failure) if isinstance(failure, MemoryError) else failure))
+        report.interrupted = True
+        report.degrade("the run was interrupted during its pilots: nothing was simulated")
     pilot_seconds = time.perf_counter() - clock - (sim.compile_seconds - compiled)
     if report.problems:
         report.pilot_seconds, report.compile_seconds = pilot_seconds, sim._take_compile_seconds() + chooser.compile_seconds
         return report
     note = f"note: {chooser.describe(steps)}"
-    if chooser.may_adopt(steps) and not any(observers.values()):
+    if chooser.may_adopt(steps):
         report = chooser.adopt()
         pilot_seconds -= report.wall_seconds
     else:
-        report = chooser.run(steps, **observers)
+        report = chooser.run(steps)
     report.pilot_seconds = pilot_seconds
     report.compile_seconds += sim._take_compile_seconds() + chooser.compile_seconds
     report.problems.insert(0, note)
@@ -98,19 +95,17 @@ def _check_error(tolerance: float, report: RunReport) -> None:
     if error is not None and error <= tolerance:
         return
     found = "unknown" if error is None else f"estimated at {100.0 * error:.2g} %"
-    report.problems.append(f"the error in time is {found}, and the tolerance is {100.0 * tolerance:.3g} %")
-    if report.status == "ok":
-        report.status = "degraded"
+    report.degrade(f"the error in time is {found}, and the tolerance is {100.0 * tolerance:.3g} %")
 
 
 class Chooser:
-    """Chooses how a simulator runs for `seconds` [s] by `run` (`running.run_steps`). stop, fps: as for `Simulator.run`.
+    """Chooses how a simulator carries out a run.
 
     A frame of the pilots is a whole part of one of the run, so that there are at least LEAST_FRAMES.
     """
 
-    def __init__(self, sim: "Simulator", run: RunFunction, seconds: float, fps: float | None, stop: Callable[[], bool] | None):
-        self._sim, self._run_steps, self._seconds, self._fps, self._stop = sim, run, seconds, fps, stop
+    def __init__(self, sim: "Simulator", request: RunRequest):
+        self._sim, self._request, seconds, fps = sim, request, request.seconds, request.fps
         self._tolerance = sim.settings.tolerance
         self._parts = 1 if fps is None else max(1, math.ceil(LEAST_FRAMES / (seconds * fps)))  # of a frame of the run
         self._frames = make_frames(sim, seconds, seconds / MOST_FRAMES if fps is None else 1.0 / (fps * self._parts))
@@ -147,8 +142,7 @@ class Chooser:
     def _use(self, integrator: str, dt: float) -> None:
         """Let the simulator have an integrator, and begin its ladder."""
         if self._sim.settings.integrator != integrator:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore", UserWarning)  # the simulator has given them
+            with collected_warnings():  # the simulator has given them
                 self._sim._replace(integrator=integrator, dt=dt)
         self.ladder = self._ladder()
 
@@ -159,9 +153,9 @@ class Chooser:
         while True:
             per_frame = next(sizes)
             steps = float(per_frame) * self._frames.count
-            budget = Budget(sim.scene, sim.touches, explicit / max(1.0, float(per_frame)), steps)
+            add_cost = budget(sim.scene, sim.touches, explicit / max(1.0, float(per_frame)), steps)
             try:
-                ladder.add(self._pilot(per_frame, on_step=budget.add))
+                ladder.add(self._pilot(per_frame, on_step=add_cost))
             except Spent:
                 return None
             needed = ladder.steps_needed(self._tolerance)
@@ -232,14 +226,12 @@ class Chooser:
             raise SimulationError(f"every pilot failed, the last one because of {self._last_failure[1]}")
         return math.ceil(self.ladder.pilots[-1].per_frame)
 
-    def _pilot(
-        self, per_frame: Fraction, part: Part | None = None, keeps: tuple[str, ...] = (), on_step: StepCallback | None = None
-    ) -> Pilot:
+    def _pilot(self, per_frame: Fraction, part: Part | None = None, **options) -> Pilot:
         """Run a pilot, see `Frames.pilot`.
 
         Raises SimulationError if it and the one before fail: smaller steps do not help.
         """
-        pilot = self._frames.pilot(self._sim, per_frame, self._stop, self._run_steps, part, keeps, on_step)
+        pilot = self._frames.pilot(self._sim, per_frame, self._request.stop, part, **options)
         report, before = pilot.report, self._last_failure
         self.compile_seconds += report.compile_seconds
         if report.interrupted:
@@ -262,8 +254,9 @@ class Chooser:
     # --- the run --------------------------------------------------------------------------------------------------------
 
     def may_adopt(self, steps: int) -> bool:
-        """Whether the last pilot had the steps and the frames of the run."""
-        return self.ladder.pilots[-1].per_frame == steps and self._parts == 1 and self._fps is not None
+        """Whether the last pilot had the steps and the frames of the run, which nothing observes."""
+        asked, same = self._request, self.ladder.pilots[-1].per_frame == steps and self._parts == 1
+        return same and asked.fps is not None and asked == RunRequest(asked.seconds, asked.fps, asked.stop)
 
     def adopt(self) -> RunReport:
         """Let the last pilot be the run: take the state at its end, and its report and warnings."""
@@ -277,20 +270,20 @@ class Chooser:
         self._add_vibrations(pilot.report.error_estimate, pilot)
         return pilot.report
 
-    def run(self, steps: int, on_frame=None, **observers) -> RunReport:
-        """Run the simulator with steps in the time of a frame. observers: further arguments of `running.run_steps`."""
-        sim = self._sim
+    def run(self, steps: int) -> RunReport:
+        """Run the simulator with steps in the time of a frame."""
+        sim, asked = self._sim, self._request
         made = Pilot(sim.settings.integrator, Fraction(steps))
-        recorder = Recorder(made, self._frames, Fraction(1, steps) if self._fps is None else Fraction(self._parts))
+        recorder = Recorder(made, self._frames, Fraction(1, steps) if asked.fps is None else Fraction(self._parts))
 
         def frame(sim: "Simulator", index: int, report) -> None:
             recorder.frame(sim, index, report)
-            if on_frame is not None:
-                on_frame(sim, index, report)
+            if asked.on_frame is not None:
+                asked.on_frame(sim, index, report)
 
         sim.dt = self._dt(steps)
         before = sim._host().changes
-        report = self._run_steps(sim, self._seconds, frame, self._fps, self._stop, **observers)
+        report = run_steps(sim, replace(asked, on_frame=frame))
         estimate = self.estimate(made)
         if sim._host().changes != before or sim.dragged is not None:
             estimate = ErrorEstimate(notes=["the errors are unknown: state or numbers were changed during the run"])
@@ -305,13 +298,13 @@ class Chooser:
         ladder, bodies = self.ladder, self._sim.scene.bodies
         made = ErrorEstimate(bodies={body.name: BodyError() for body in bodies}, twins=[f"pilots with {self._pilot_steps()}"])
         last = ladder.pilots[-1]
-        made.excursion = ladder.excursion(run if len(run.frames) > 1 else last)
+        made.excursion = ladder.excursion(run if len(run.positions) > 1 else last)
         if made.excursion == 0.0:
             made.time = 0.0
             made.notes.append("nothing moves but by rounding")
         elif ladder.diverges:
             made.notes.append("the error in time is unknown: the paths of different steps diverge")
-        elif len(run.frames) < 2 or not (coarser := [one for one in ladder.pilots if one.per_frame < run.per_frame]):
+        elif len(run.positions) < 2 or not (coarser := [one for one in ladder.pilots if one.per_frame < run.per_frame]):
             made.time = ladder.error
             if len(ladder.pilots) == 1:
                 made.notes.append(

@@ -21,6 +21,7 @@ from taisoft.stability import constrained_axes, stable_dt
 if TYPE_CHECKING:
     from taisoft.simulator import Simulator
 
+MIN_STEPS = 32  # of a run whose error is estimated by larger steps
 STABLE_FRACTION = 0.9  # of the stable dt, for explicit steps of a twin
 TIGHTER = 0.1  # a twin's tolerances over those of the run; much less takes many iterations, and in f32 meets rounding
 REFINED, ORDER = "refined", "order"  # meshes of a twin, besides a scene
@@ -60,17 +61,14 @@ class Twin:
         return self.sim.positions()[self.theirs] - self._shift
 
 
-def larger_steps(sim: "Simulator") -> Iterator[Twin]:
-    """Twins with twice and four times the step; none where explicit steps would be unstable."""
-    if sim.settings.explicit and 4.0 * sim.dt > STABLE_FRACTION * sim.stable_dt:
-        return
-    for ratio in (2, 4):
-        yield Twin(f"dt = {ratio * sim.dt:.4g} s", sim._copy(dt=ratio * sim.dt), ratio, per=ratio)
-
-
-def smaller_steps(sim: "Simulator") -> Twin:
-    """A twin with half the step."""
-    return Twin(f"dt = {0.5 * sim.dt:.4g} s", sim._copy(dt=0.5 * sim.dt), 0.5, steps=2)
+def other_steps(sim: "Simulator", steps: int) -> Iterator[Twin]:
+    """Twins of a run of `steps` steps: with twice and four times the step, but half of it for few steps, or where explicit ones
+    would be unstable."""
+    if steps >= MIN_STEPS and not (sim.settings.explicit and 4.0 * sim.dt > STABLE_FRACTION * sim.stable_dt):
+        for ratio in (2, 4):
+            yield Twin(f"dt = {ratio * sim.dt:.4g} s", sim._copy(dt=ratio * sim.dt), ratio, per=ratio)
+    else:
+        yield Twin(f"dt = {0.5 * sim.dt:.4g} s", sim._copy(dt=0.5 * sim.dt), 0.5, steps=2)
 
 
 def tighter(sim: "Simulator") -> Twin | None:

@@ -9,7 +9,6 @@ import random
 import sys
 import time
 import traceback
-import warnings
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass
@@ -20,7 +19,7 @@ from pathlib import Path
 
 import numpy as np
 
-from taisoft.errors import SceneError, value_text
+from taisoft.errors import SceneError, collected_warnings, value_text
 from taisoft.many.places import serve
 from taisoft.many.store import code_digest, digest, sources
 from taisoft.records import RunReport
@@ -139,8 +138,7 @@ def _row(function: Callable, parameters: dict, make: Make) -> dict:
     """Return the record of a row: status, problems, values, arrays, and wall time [s]."""
     record = {"status": "ok", "problems": [], "values": {}, "arrays": {}, "raised": False}
     start = time.perf_counter()
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always", UserWarning)
+    with collected_warnings() as texts:
         try:
             for name, value in _checked(function(**parameters), parameters).items():
                 if isinstance(value, RunReport):
@@ -157,8 +155,7 @@ def _row(function: Callable, parameters: dict, make: Make) -> dict:
             text += f" ({Path(make.file).name}, line {lines[-1]})" if lines else ""
             record |= {"status": "failed", "problems": [text], "raised": True}
     record["wall_seconds"] = time.perf_counter() - start
-    texts = (f"warning: {one.message}" for one in caught if issubclass(one.category, UserWarning))
-    record["problems"] += dict.fromkeys(texts)
+    record["problems"] += [f"warning: {text}" for text in texts]
     return record
 
 

@@ -134,7 +134,7 @@ class Many:
     """Rows to run: each is executed once for equal parameters, or taken from the store."""
 
     def __init__(self, make: Make, parameters: list[dict], store: Store):
-        self._make, self._parameters, self._store = make, parameters, store
+        self._make, self._store = make, store
         self._request, self._notes, self._seen = make.request(), [], {}
         self._keys = [digest([make.name, one])[:32] for one in parameters]
         self._rows: dict[str, Row] = {}

@@ -51,6 +51,4 @@ class FrameTable:
         """Write the rows so far. Raises OutputError."""
         write_bytes(self.path, csv_text([self._header, *self._rows]).encode())
 
-    def close(self) -> None:
-        """Write the table. Raises OutputError."""
-        self.flush()
+    close = flush

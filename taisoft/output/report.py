@@ -219,12 +219,13 @@ class Bar:
             self._bar = None
 
 
-class Progress:
+class Progress(Bar):
     """Observer that shows the progress of a run of `seconds` [s] of simulated time on a stream (stderr by default): a Bar with
     steps/s and the remaining time."""
 
     def __init__(self, seconds: float, label: str = "run", stream: TextIO | None = None):
-        self.seconds, self._bar = seconds, Bar(seconds, label, stream or sys.stderr, "{:.3f} of {:g} s")
+        super().__init__(seconds, label, stream or sys.stderr, "{:.3f} of {:g} s")
+        self.seconds = seconds
         self._started: float | None = None  # wall time of the first frame; construction and compilation come before
         self._first_time = self._compiled = self._time = 0.0
         self._text = "starting"
@@ -237,15 +238,11 @@ class Progress:
             self._started, self._first_time, self._first_step = now, sim.time, sim.step_count
             self._compiled = sim.compile_seconds
         self._time, self._text = sim.time, self._speed(sim, now - self._started - (sim.compile_seconds - self._compiled))
-        self._bar.show(self._time, self._text, now)
+        self.show(self._time, self._text, now)
 
     def iteration(self, n: int) -> None:
         """Show how many Newton iterations a long step has taken so far, as `Simulator.run` calls it."""
-        self._bar.show(self._time, f"{self._text}, a step with {n} Newton iterations so far", time.perf_counter())
-
-    def close(self) -> None:
-        """Stop the bar; a second call does nothing."""
-        self._bar.close()
+        self.show(self._time, f"{self._text}, a step with {n} Newton iterations so far", time.perf_counter())
 
     def _speed(self, sim, elapsed: float) -> str:
         done = sim.time - self._first_time

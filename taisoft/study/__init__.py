@@ -4,7 +4,7 @@ This file holds what is requested: the axes of the grid and the request. It impo
 reads its options from here.
 """
 
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import dataclass, field, fields
 
 
 def _axis(meaning: str, **default):
@@ -28,10 +28,6 @@ class Setting:
     contact_solver: str = _axis("auto or a solver", default="auto")
     contact_tolerance: float | None = _axis("relative, or none", default=None)
     arch: str = _axis("cpu, cuda", default="cpu")
-
-    def simulator(self) -> dict:
-        """Return the arguments of Simulator."""
-        return simulator_arguments(asdict(self))
 
     @property
     def mesh(self) -> tuple[int, int | None]:
@@ -75,8 +71,3 @@ class Request:
     repeats: int = 3
     tolerance: float = 0.01
     by: str = "max"
-
-    def for_plan(self) -> dict:
-        """Return what the plan depends on."""
-        keys = ("axes", "seconds", "reference_dt", "reference_integrator", "reference_refine")
-        return {key: getattr(self, key) for key in keys}

@@ -1,16 +1,11 @@
-"""One run of a study, in its own process: recorded once at the frames, then timed from the start without recording.
-
-Benchmarks time whole runs with `advance`, too.
-"""
+"""One run of a study, in its own process: recorded once at the frames, then timed from the start without recording."""
 
 import time
-import warnings
-from dataclasses import dataclass
 
 import numpy as np
 
 from taisoft.backend import runtime
-from taisoft.errors import SimulationError, TaisoftError
+from taisoft.errors import SimulationError, TaisoftError, collected_warnings
 from taisoft.fem.loads import SceneLoads
 from taisoft.fem.reference import gravity_mass, lumped_mass
 from taisoft.machine import load_average, usable_cores
@@ -25,38 +20,6 @@ ITERATIONS = ("newton_iterations", "linear_iterations", "contact_iterations")
 SHORT_SECONDS, MAX_RUNS = 0.5, 25  # short runs are repeated until their total time [s] or their number reaches these
 
 
-@dataclass
-class TimedRun:
-    """Totals of some steps. seconds: wall time without compiling [s]; inverted: maximum inverted tets in one report."""
-
-    steps: int = 0
-    seconds: float = 0.0
-    unconverged: int = 0
-    inverted: int = 0
-    newton_iterations: int = 0
-    linear_iterations: int = 0
-
-    def __add__(self, other: "TimedRun") -> "TimedRun":
-        sums = {k: a + b for (k, a), b in zip(vars(self).items(), vars(other).values())}
-        return TimedRun(**sums | {"inverted": max(self.inverted, other.inverted)})
-
-
-def advance(sim: Simulator, steps: int) -> TimedRun:
-    """Take `steps` steps in the largest batches that sim.advance allows, as sim.run does between two frames."""
-    timed = TimedRun(steps)
-    compiled, start = sim.compile_seconds, time.perf_counter()
-    done = 0
-    while done < steps:
-        report = sim.advance(steps - done)
-        done += report.steps
-        timed.unconverged += not report.converged
-        timed.inverted = max(timed.inverted, report.n_inverted)
-        timed.newton_iterations += report.newton_iterations
-        timed.linear_iterations += report.linear_iterations
-    timed.seconds = time.perf_counter() - start - (sim.compile_seconds - compiled)
-    return timed
-
-
 def measure(scene: Scene, task: dict) -> dict:
     """Return the record of one run of a scene that is already refined, as plain data; a failed run's record says why.
 
@@ -66,10 +29,8 @@ def measure(scene: Scene, task: dict) -> dict:
     setting = simulator_arguments(task["setting"])
     record = {"task": task, "machine": machine(), "versions": versions(), "cores": usable_cores(), "load": load_average()}
     record |= _scene_facts(scene, task)
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always", UserWarning)
+    with collected_warnings() as record["warnings"]:
         record |= _run(scene, setting | task["fixed"], task)
-    record["warnings"] = list(dict.fromkeys(str(one.message) for one in caught if issubclass(one.category, UserWarning)))
     return record | {"load_at_the_end": load_average(), "peak_memory_bytes": peak_memory(), "threads": runtime.threads()}
 
 
@@ -145,10 +106,13 @@ def _timed(sim: Simulator, task: dict, recorded: float):
     if recorded * length > MAX_REPEATED_SECONDS:  # without the first launch of each kernel
         yield recorded
         return
-    total, count = 0.0, 0
+    total, count, steps = 0.0, 0, task["steps"] * task["frames"]
     while count < task["repeats"] or (total < SHORT_SECONDS and count < MAX_RUNS):
         sim.reset()
-        seconds = advance(sim, task["steps"] * task["frames"]).seconds
+        done, compiled, start = 0, sim.compile_seconds, time.perf_counter()
+        while done < steps:  # in the largest batches, as sim.run does between two frames
+            done += sim.advance(steps - done).steps
+        seconds = time.perf_counter() - start - (sim.compile_seconds - compiled)
         total, count = total + seconds, count + 1
         yield seconds / length
 

@@ -4,6 +4,7 @@ The picture, for which matplotlib is needed, shows error against time on log axe
 references' own errors.
 """
 
+import itertools
 import json
 from pathlib import Path
 
@@ -85,7 +86,6 @@ def _draw(study: Study, rows: list[Row], path: Path) -> None:
     if not shown:
         panel.plot([], [], **REFERENCE, label=f"reference's own error:\n{own_errors[-1]:.1g}, far below")
     _draw_points(panel, study, rows)
-    _label_front(panel, study)
     times = [x for row in rows for x in np.percentile(row.seconds, (25, 75))]
     low, high = min(smallest, tolerance, *shown), max(largest, tolerance, *shown)
     panel.set(xscale="log", yscale="log", xlim=(min(times) / 1.6, max(times) * 1.9), ylim=(low / 2.0, high * 2.0))
@@ -102,20 +102,15 @@ def _draw(study: Study, rows: list[Row], path: Path) -> None:
 
 
 def _draw_front(panel, study: Study) -> None:
-    """Plot the front as steps: vertical before the first point, horizontal after the last."""
-    times, errors = zip(*((row.timing.median, row.resolved_error(study.request.by)) for row in study.front()))
+    """Plot the front as steps: vertical before the first point, horizontal after the last; label at most MAX_LABELS points."""
+    front = study.front()
+    times, errors = zip(*map(study.point, front))
     corners = [times[0], *times, OUTSIDE], [OUTSIDE, *errors, errors[-1]]
     panel.step(*corners, where="post", color="#999999", lw=1.2, zorder=1, label="Pareto front")
-
-
-def _label_front(panel, study: Study) -> None:
-    """Label points of the front with their time step, at most MAX_LABELS of them."""
-    front = study.front()
+    box = {"facecolor": "white", "alpha": 0.8, "lw": 0, "pad": 0.5}
     for row in front[:: -(-len(front) // MAX_LABELS)]:
-        place = (row.timing.median, row.resolved_error(study.request.by))
         text = f"{1e3 * row.setting['dt']:.3g} ms"
-        box = {"facecolor": "white", "alpha": 0.8, "lw": 0, "pad": 0.5}
-        panel.annotate(text, place, (5, 7), textcoords="offset points", fontsize=7, color="#333333", bbox=box)
+        panel.annotate(text, study.point(row), (5, 7), textcoords="offset points", fontsize=7, color="#333333", bbox=box)
 
 
 def _draw_points(panel, study: Study, rows: list[Row]) -> None:
@@ -127,21 +122,20 @@ def _draw_points(panel, study: Study, rows: list[Row]) -> None:
 
     integrators = list(dict.fromkeys(row.setting["integrator"] for row in rows))
     kinds = list(dict.fromkeys(map(kind_of, rows)))
-    for kind in kinds:
-        for integrator in integrators:
-            series = [row for row in rows if row.setting["integrator"] == integrator and kind_of(row) == kind]
-            series.sort(key=lambda row: row.setting["dt"])
-            colour = COLOURS[(kinds.index(kind) if len(kinds) > 1 else integrators.index(integrator)) % len(COLOURS)]
-            places = [row.timing.median for row in series], [row.resolved_error(study.request.by) for row in series]
-            panel.plot(*places, color=colour, lw=0.8, alpha=0.4, zorder=1)
-            for status, fill, suffix in (("ok", colour, ""), ("degraded", "white", " (degraded)")):
-                if selected := [row for row in series if row.status == status]:
-                    label = ", ".join(filter(None, (integrator, kind))) + suffix
-                    _draw_series(panel, study, selected, color=colour, mfc=fill, marker=MARKERS.get(integrator, "X"), label=label)
+    for kind, integrator in itertools.product(kinds, integrators):
+        series = [row for row in rows if row.setting["integrator"] == integrator and kind_of(row) == kind]
+        series.sort(key=lambda row: row.setting["dt"])
+        colour = COLOURS[(kinds.index(kind) if len(kinds) > 1 else integrators.index(integrator)) % len(COLOURS)]
+        panel.plot(*_points(study, series), color=colour, lw=0.8, alpha=0.4, zorder=1)
+        style = {"color": colour, "marker": MARKERS.get(integrator, "X"), "ls": "none", "ms": 6, "elinewidth": 1.0, "capsize": 2}
+        for status, fill, suffix in (("ok", colour, ""), ("degraded", "white", " (degraded)")):
+            if selected := [row for row in series if row.status == status]:
+                label = ", ".join(filter(None, (integrator, kind))) + suffix
+                times, errors = _points(study, selected)
+                bars = np.abs(np.transpose([np.percentile(row.seconds, (25, 75)) for row in selected]) - times)
+                panel.errorbar(times, errors, xerr=bars, mfc=fill, label=label, **style)
 
 
-def _draw_series(panel, study: Study, rows: list[Row], **style) -> None:
-    middle = [row.timing.median for row in rows]
-    bars = np.transpose([np.abs(np.percentile(row.seconds, (25, 75)) - row.timing.median) for row in rows])
-    errors = [row.resolved_error(study.request.by) for row in rows]
-    panel.errorbar(middle, errors, xerr=bars, ls="none", ms=6, elinewidth=1.0, capsize=2, **style)
+def _points(study: Study, rows: list[Row]) -> np.ndarray:
+    """Return times and errors (2,k) of rows."""
+    return np.reshape([study.point(row) for row in rows], (-1, 2)).T

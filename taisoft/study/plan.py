@@ -11,6 +11,7 @@ import math
 from collections.abc import Callable, Iterable
 from dataclasses import asdict
 from fractions import Fraction
+from functools import cache
 
 from taisoft.dynamics.schemes import EXPLICIT, INTEGRATORS
 from taisoft.errors import SceneError, TaisoftError, reworded
@@ -18,7 +19,7 @@ from taisoft.estimation.order import nominal_order
 from taisoft.scene.scene import Scene
 from taisoft.settings import WITH_MULTIPLIERS, check_settings, kept_by_multipliers
 from taisoft.stability import stable_dt
-from taisoft.study import AXES, DEFAULTS, Setting, mesh_name
+from taisoft.study import AXES, DEFAULTS, Setting, mesh_name, simulator_arguments
 
 IMPLICIT_DEFAULT = ("implicit_euler", "bdf2")
 DT_FACTORS = {False: (2.0, 1.0, 0.5, 0.25), True: (0.5, 1.0, 4.0, 8.0, 16.0)}  # of the scene's dt; key: explicit integrator
@@ -72,25 +73,23 @@ def frame_time(steps: Iterable[float], seconds: float) -> tuple[float, int]:
     return every * common, max(1, round(seconds / (every * common)))
 
 
-def make_plan(variant: Variant, solver: dict, request: dict) -> dict:
-    """Return the plan of a study as plain data. request: see `Request.for_plan`. Raises SceneError if nothing can be run."""
-    return Planner(variant, solver, request).plan()
-
-
 class Planner:
-    """Plans the runs of a scene's variants; scenes and stability limits are computed once. A mesh is (refine, order)."""
+    """Plans the runs of a scene's variants; scenes and stability limits are computed once. A mesh is (refine, order).
+
+    request: the fields of a `Request`.
+    """
 
     def __init__(self, variant: Variant, solver: dict, request: dict):
         self._variant, self._solver, self._request = variant, solver, request
         self._scenes: dict[tuple, Scene | str] = {}
-        self._limits: dict[tuple, float] = {}
+        self._limit = cache(lambda mesh, integrator: stable_dt(self._scene(mesh), integrator == "velocity_verlet"))
         self._notes: list[str] = []
         # all other entries of the solver dict apply to every run
         left_out = (*AXES, "seconds", "fps", "quantities", "draggable", "tolerance")
         self.fixed = {key: value for key, value in solver.items() if key not in left_out}
 
     def plan(self) -> dict:
-        """Return the plan; see `make_plan`."""
+        """Return the plan of the study as plain data. Raises SceneError if nothing can be run."""
         base = self._scene((0, None))
         refused = {one: self.refusal(one) for one in expand(complete(self._request["axes"], self._solver))}
         settings = [one for one, why in refused.items() if not why]
@@ -187,15 +186,10 @@ class Planner:
         return "velocity_verlet" if not kind and limit > 2.0 * target / EXPLICIT_DT_RATIO else "implicit_midpoint"
 
     def _check(self, scene: Scene, setting: Setting) -> None:
-        check_settings(scene, **setting.simulator(), **self.fixed)
+        check_settings(scene, **simulator_arguments(asdict(setting)), **self.fixed)
 
     def _touches(self, scene: Scene) -> bool:
         return scene.pushes(self.fixed.get("self_collision", False))
-
-    def _limit(self, mesh: tuple, integrator: str) -> float:
-        if (mesh, integrator) not in self._limits:
-            self._limits[mesh, integrator] = stable_dt(self._scene(mesh), integrator == "velocity_verlet")
-        return self._limits[mesh, integrator]
 
     def _scene(self, mesh: tuple) -> Scene:
         """Return the scene with a mesh. Raises SceneError if it cannot be built, which is tried once."""

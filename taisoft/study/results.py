@@ -17,25 +17,12 @@ Point = tuple[float, float]  # time, error; smaller is better in both
 
 def front(points: Sequence[Point]) -> list[int]:
     """Return indices of the points that no other dominates, by rising time. Equal points are all included or none; nan never."""
-    known = [k for k, p in enumerate(points) if not any(map(math.isnan, p))]
+    known = (k for k, p in enumerate(points) if not any(map(math.isnan, p)))
     found: list[int] = []
-    lowest = math.inf
     for k in sorted(known, key=lambda k: points[k]):
-        if points[k][1] < lowest or (found and points[k] == points[found[-1]]):
+        if not found or points[k][1] < points[found[-1]][1] or points[k] == points[found[-1]]:
             found.append(k)
-            lowest = min(lowest, points[k][1])
     return found
-
-
-def cheapest(points: Sequence[Point], tolerance: float) -> int | None:
-    """Return the index of the fastest point within the tolerance, the more exact at equal times; None if there is none."""
-    return next((k for k in front(points) if points[k][1] <= tolerance), None)
-
-
-def nearest(points: Sequence[Point]) -> int | None:
-    """Return the index of the point of least error, the fastest of equal ones; None without points."""
-    found = front(points)
-    return next((k for k in found if points[k][1] == points[found[-1]][1]), None)
 
 
 @dataclass
@@ -64,23 +51,23 @@ class Study:
         """Return the rows that have a time and an error."""
         return [row for row in self.rows if row.seconds and row.resolved_error(self.request.by) is not None]
 
-    def points(self) -> list[Point]:
-        """Return (time, error) of the comparable rows."""
-        return [(row.timing.median, row.resolved_error(self.request.by)) for row in self.comparable_rows()]
+    def point(self, row: Row) -> Point:
+        """Return (time, error) of a comparable row."""
+        return row.timing.median, row.resolved_error(self.request.by)
 
     def front(self) -> list[Row]:
         """Return the rows of the Pareto front, by rising time."""
-        return [self.comparable_rows()[k] for k in front(self.points())]
+        rows = self.comparable_rows()
+        return [rows[k] for k in front(list(map(self.point, rows)))]
 
     def cheapest(self) -> Row | None:
-        """Return the fastest row within the tolerance, or None."""
-        k = cheapest(self.points(), self.request.tolerance)
-        return None if k is None else self.comparable_rows()[k]
+        """Return the fastest row within the tolerance, the more exact at equal times, or None."""
+        return next((row for row in self.front() if self.point(row)[1] <= self.request.tolerance), None)
 
     def nearest(self) -> Row | None:
-        """Return the row of least error, or None."""
-        k = nearest(self.points())
-        return None if k is None else self.comparable_rows()[k]
+        """Return the row of least error, the fastest of equal ones, or None."""
+        found = self.front()
+        return next((row for row in found if self.point(row)[1] == self.point(found[-1])[1]), None)
 
 
 def text_of(study: Study) -> str:
@@ -242,11 +229,7 @@ def plain_of(study: Study) -> dict:
         "references": [{k: getattr(r, k) for k in reference_keys} | {"in_space": r is study.space} for r in study.references],
         "cheapest": cheapest and cheapest.setting,
         "nearest": nearest and nearest.setting,
-        "notes": study.notes,
-        "ended": study.ended,
-        "machines": study.machines,
-        "workers": study.workers,
-        "versions": study.versions,
+        **{key: getattr(study, key) for key in ("notes", "ended", "machines", "workers", "versions")},
         "scene_digest": study.plan["scenes"]["refine 0"],
         "code_digest": study.plan["code"],
     }

@@ -1,7 +1,7 @@
 """Run a study: plan it, execute the missing runs, and compare each with its reference. No Taichi here: every run is a process."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 
 from taisoft.errors import SceneError, SimulationError
 from taisoft.estimation.comparison import Error
@@ -45,12 +45,12 @@ def steps_in(frame: float, dt: float) -> int:
 
 @dataclass(frozen=True)
 class Outcome:
-    """Outcome of a task: a record, or why there is none: it failed without one, or was left out."""
+    """Outcome of a task: a record; without one the status, "failed" or "left out", and the reason."""
 
     task: Task
     record: dict | None
-    failed: str
-    left_out: str
+    status: str = ""
+    reason: str = ""
 
 
 @dataclass
@@ -72,7 +72,7 @@ class Runner:
         Return None if interrupted. Raises SceneError if the scene cannot be studied.
         """
         answers: dict[str, dict] = {}
-        requests = [("plan", self._request("plan") | {"request": self.request.for_plan()})]
+        requests = [("plan", self._request("plan") | {"request": asdict(self.request)})]
         if carry_out(requests, [self.planner], answers.__setitem__, stop_requested=self.stop_requested):
             return None
         found = answers["plan"]
@@ -90,15 +90,15 @@ class Runner:
         study.kept = self.store.folder is not None
         references, settings = tasks_of(plan)
         keys = [self.key(plan, task) for task in references + settings]
-        tasks = dict(zip(keys, references + settings))
-        records, failed, unfinished = self._carry_out(plan, tasks)
-        study.ended = "; ".join(dict.fromkeys(BUDGET_SPENT if why == CUT_BY_BUDGET else why for why in unfinished.values()))
-        study.cut = [str(tasks[key]) for key in keys if unfinished.get(key) == CUT_BY_BUDGET]
+        found = self._carry_out(plan, dict(zip(keys, references + settings)))
+        outcomes = [found[key] for key in keys]
+        left = [one.reason for one in found.values() if one.status == "left out"]
+        study.ended = "; ".join(dict.fromkeys(BUDGET_SPENT if why == CUT_BY_BUDGET else why for why in left))
+        study.cut = [str(one.task) for one in outcomes if one.reason == CUT_BY_BUDGET]
         study.notes += self.store.damaged
-        outcomes = [Outcome(tasks[k], records.get(k), failed.get(k, ""), unfinished.get(k, "")) for k in keys]
         made = _add_references(study, outcomes[: len(references)])
         _add_rows(study, outcomes[len(references) :], made)
-        _note_differences(study, records)
+        _note_differences(study, [one.record for one in found.values() if one.record is not None])
         return study
 
     def _request(self, action: str) -> dict:
@@ -116,29 +116,27 @@ class Runner:
         scene = [plan["scenes"][mesh_name(task.setting)], plan["sources"]]
         return digest([self._task(plan, task), scene, plan["code"], hardware])[:32]
 
-    def _carry_out(self, plan: dict, tasks: dict[str, Task]) -> tuple[dict, dict, dict]:
-        """Return by key: records, old ones included; errors of runs without a record; reasons of unfinished runs."""
-        records = {key: record for key in tasks if (record := self.store.read(key)) is not None}
-        failed: dict[str, str] = {}
-        before = f", {len(records)} of them already done" if records else ""
+    def _carry_out(self, plan: dict, tasks: dict[str, Task]) -> dict[str, Outcome]:
+        """Return the outcomes by key, those of finished runs from the store."""
+        found = {key: Outcome(task, record) for key, task in tasks.items() if (record := self.store.read(key)) is not None}
+        before = f", {len(found)} of them already done" if found else ""
         self.report(f"{len(tasks)} runs of {plan['frame'] * plan['frames']:g} s{before}")
 
         def done(key: str, answer: dict) -> None:
             if "answer" in answer:
-                records[key] = self.store.write(key, answer["answer"])
+                found[key] = Outcome(tasks[key], self.store.write(key, answer["answer"]))
             else:
-                failed[key] = answer.get("error") or answer["crash"]
-            result = failed.get(key) or _summary(records[key])
-            self.report(f"{len(records) + len(failed)} of {len(tasks)}: {tasks[key]}: {result}")
+                found[key] = Outcome(tasks[key], None, "failed", answer.get("error") or answer["crash"])
+            self.report(f"{len(found)} of {len(tasks)}: {tasks[key]}: {found[key].reason or _summary(found[key].record)}")
 
         common = self._request("run") | {"sources": plan["sources"], "code": plan["code"]}
         requests = []
         for key, task in tasks.items():
-            if key not in records:
+            if key not in found:
                 scene = plan["scenes"][mesh_name(task.setting)]
                 requests.append((key, common | {"digest": scene, "task": self._task(plan, task)}))
         unfinished = carry_out(requests, self.places, done, seconds_left=self.seconds_left, stop_requested=self.stop_requested)
-        return records, failed, unfinished
+        return found | {key: Outcome(tasks[key], None, "left out", why) for key, why in unfinished.items()}
 
 
 def _add_references(study: Study, outcomes: list[Outcome]) -> list[Reference | None]:
@@ -148,7 +146,7 @@ def _add_references(study: Study, outcomes: list[Outcome]) -> list[Reference | N
         try:
             for one in (fine, coarse):
                 if one.record is None:
-                    raise SimulationError(f"{one.task} is missing: {one.failed or one.left_out}")
+                    raise SimulationError(f"{one.task} is missing: {one.reason}")
             made = make_reference(fine.record, coarse.record, planned["kind"], planned["order_in_time"])
             study.references.append(made)
             study.notes += [f"{fine.task}: {text}" for text in dict.fromkeys(made.problems)]
@@ -171,7 +169,7 @@ def _add_rows(study: Study, outcomes: list[Outcome], references: list[Reference 
             continue
         run = next(runs)
         if run.record is None:
-            study.rows.append(Row(run.task.setting, "failed" if run.failed else "left out", run.failed or run.left_out))
+            study.rows.append(Row(run.task.setting, run.status, run.reason))
             continue
         study.versions = study.versions or run.record["versions"]
         row = row_of(run.record, _own_reference(study.plan, references, run.record))
@@ -206,13 +204,13 @@ def _own_reference(plan: dict, references: list[Reference | None], record: dict)
     return next((reference for reference, fits in zip(references, same) if fits), None)
 
 
-def _note_differences(study: Study, records: dict) -> None:
+def _note_differences(study: Study, records: list[dict]) -> None:
     """Note the runs' warnings, and that times come from different machines."""
-    names = {record["machine"]["name"] for record in records.values() if record["seconds"]}
+    names = {record["machine"]["name"] for record in records if record["seconds"]}
     if len(names) > 1:
         listed = ", ".join(sorted(names))
         study.notes.append(f"times come from {len(names)} machines ({listed}) and are comparable only if these are alike")
-    study.notes += list(dict.fromkeys(f"warning: {text}" for record in records.values() for text in record["warnings"]))
+    study.notes += list(dict.fromkeys(f"warning: {text}" for record in records for text in record["warnings"]))
 
 
 def _summary(record: dict) -> str:

@@ -15,7 +15,7 @@ from taisoft.estimation.first_choice import settings_for, stable_steps
 from taisoft.estimation.ladder import Ladder
 from taisoft.estimation.pilots import FASTEST, HARDEST, Frames, Part, Pilot, distances, make_frames
 from taisoft.records import RunReport
-from taisoft.running import run_steps
+from taisoft.running import RunRequest, run_steps
 from taisoft.settings import Settings
 from tests.dynamics.scenes import cube, rubber
 from tests.estimation.stand_in import BDF2, VERLET, block, motion
@@ -25,9 +25,8 @@ FRAMES = Frames(1.0, 20.0, slice(None), np.zeros(1, dtype=int), 0.0)
 
 def pilot_of(integrator: str, steps, error: float, frames=range(21), **more) -> Pilot:
     """A pilot that moves by 1 m in 20 s, too far by an error that grows with time."""
-    made = Pilot(integrator, Fraction(steps), list(frames), **more)
-    made.positions = [np.array([[k / 20.0 * (1.0 + error), 0.0, 0.0]]) for k in frames]
-    return made
+    positions = {k: np.array([[k / 20.0 * (1.0 + error), 0.0, 0.0]]) for k in frames}
+    return Pilot(integrator, Fraction(steps), positions, **more)
 
 
 def ladder_of(integrator: str, sudden: bool, sizes, impacts: bool = False, error: float = 0.001, order: float = 1.0) -> Ladder:
@@ -136,22 +135,22 @@ def test_the_hardest_part_is_that_of_an_impact():
     sim.advance(3)
     before = sim.snapshot()
     frames = make_frames(sim, 0.6, 1 / 60)
-    pilot = frames.pilot(sim, Fraction(17), None, run_steps, keeps=(HARDEST, FASTEST))
+    pilot = frames.pilot(sim, Fraction(17), None, keeps=(HARDEST, FASTEST))
     hardest, fastest = pilot.parts[HARDEST], pilot.parts[FASTEST]
-    part = frames.pilot(sim, Fraction(17), None, run_steps, part=hardest)
+    part = frames.pilot(sim, Fraction(17), None, part=hardest)
     assert all(np.array_equal(before[name], sim.snapshot()[name]) for name in before if before[name] is not None)
     assert 27 <= hardest.first <= 31 and fastest.first >= 25 and hardest.times > 1.5 and fastest.times > 3.0
     assert pilot.jump > 2.0
-    assert part.frames == list(range(hardest.first, hardest.first + frames.part + 1))
-    assert np.array_equal(part.at(part.frames), pilot.at(part.frames))
+    assert list(part.positions) == list(range(hardest.first, hardest.first + frames.part + 1))
+    assert all(np.array_equal(x, pilot.positions[frame]) for frame, x in part.positions.items())
     assert pilot.end["step_count"] == 3 + 36 * 17 and pilot.touches and not part.counts_per_step()[0]
-    coarser = frames.pilot(sim, Fraction(1, 4), None, run_steps)
-    assert coarser.frames == list(range(0, 37, 4)) and coarser.report.steps == 9
-    found, ends = distances(pilot, coarser), pilot.positions[-1] - coarser.positions[-1]
+    coarser = frames.pilot(sim, Fraction(1, 4), None)
+    assert list(coarser.positions) == list(range(0, 37, 4)) and coarser.report.steps == 9
+    found, ends = distances(pilot, coarser), pilot.positions[36] - coarser.positions[36]
     assert found.shape == (10, 8) and np.allclose(found[-1], np.linalg.norm(ends, axis=1), rtol=1e-15)
-    pilot, seen, sim.dt = make_frames(sim, 0.6, 1 / 250).pilot(sim, Fraction(4), None, run_steps), [], 1 / 1000
-    run_steps(sim, 0.6, lambda sim, *_: seen.append(sim.v), 250.0, None)
-    assert pilot.frames == [*range(0, 150, 4), 150]  # fewer than 48, and the last
+    pilot, seen, sim.dt = make_frames(sim, 0.6, 1 / 250).pilot(sim, Fraction(4), None), [], 1 / 1000
+    run_steps(sim, RunRequest(0.6, 250.0, on_frame=lambda sim, *_: seen.append(sim.v)))
+    assert list(pilot.positions) == [*range(0, 150, 4), 150]  # fewer than 48, and the last
     changes = np.diff(seen, axis=0)
     assert pilot.jump == pytest.approx(np.linalg.norm(changes, axis=2).max()) and len(seen) == 151
     assert pilot.variations == pytest.approx(np.linalg.norm(np.diff(changes, axis=0), axis=2).sum(axis=0))

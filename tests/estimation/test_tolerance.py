@@ -66,9 +66,9 @@ def test_which_pilots_choose_the_steps(make, kind, tolerance, pilots, per_frame,
     """Given by their steps in a frame."""
     found, pilot = [], Frames.pilot
 
-    def spied(frames, sim, steps, stop, run, part=None, *rest):
+    def spied(frames, sim, steps, stop, part=None, **options):
         found.append(f"{'' if part is None else 'part'}{steps}" + (" implicit" if sim.settings.integrator == BDF2 else ""))
-        return pilot(frames, sim, steps, stop, run, part, *rest)
+        return pilot(frames, sim, steps, stop, part, **options)
 
     monkeypatch.setattr(Frames, "pilot", spied)
     result = run(make(tolerance, kind, integrator="implicit_midpoint"), 0.6)

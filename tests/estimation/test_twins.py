@@ -8,7 +8,7 @@ import pytest
 import taisoft as ts
 from taisoft.errors import SimulationError
 from taisoft.estimation.comparison import Differences
-from taisoft.estimation.twins import larger_steps, on_mesh, other_mesh, smaller_steps, tighter
+from taisoft.estimation.twins import on_mesh, other_mesh, other_steps, tighter
 from taisoft.running import run
 from taisoft.stability import stable_dt
 from tests.dynamics.scenes import cube, rubber
@@ -56,8 +56,8 @@ def test_few_or_unstable_steps_are_compared_with_half_the_step():
     assert e.time * e.excursion == pytest.approx(5.0 * 0.5 / 16)
     kind = motion(stable_dt=3.9 / 60, offset=lambda sim: (0.0, 9.0 * sim.dt**2 * sim.time, 0.0))  # 4 dt would be unstable
     sim = kind(block(), 1 / 60, VERLET)
-    assert list(larger_steps(sim)) == [] and len(list(larger_steps(FALLING(block(), 1 / 60)))) == 2
-    half = smaller_steps(sim)
+    assert [[twin.ratio for twin in other_steps(FALLING(block(), 1 / 60), n)] for n in (31, 32)] == [[0.5], [2, 4]]
+    (half,) = other_steps(sim, 32)
     half.follow(3)
     assert (half.ratio, half.sim.step_count, half.sim.time) == (0.5, 6, pytest.approx(0.05))
     assert estimate(sim).order == 2.0

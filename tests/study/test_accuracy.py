@@ -16,8 +16,9 @@ from taisoft.errors import SimulationError
 from taisoft.estimation.comparison import Error, shared_nodes
 from taisoft.mesh.nodes import make_nodes
 from taisoft.mesh.shapes import box_mesh
-from taisoft.study.accuracy import Reference, error_in_space, finest_own_error, momentum_error
-from taisoft.study.results import cheapest, front, nearest
+from taisoft.study import Request
+from taisoft.study.accuracy import Reference, Row, error_in_space, finest_own_error, momentum_error
+from taisoft.study.results import Study, front
 
 COARSE = box_mesh((2, 1, 1), (2.0, 1.0, 1.0))
 FINE = make_nodes(COARSE, 2).positions
@@ -93,14 +94,15 @@ def test_front_holds_exactly_the_undominated_points(candidates):
 
 @given(points, st.floats(0.0, 5.0))
 def test_cheapest_is_the_fastest_within_the_tolerance_and_nearest_has_the_smallest_error(candidates, tolerance):
-    found, accurate = cheapest(candidates, tolerance), [p for p in candidates if p[1] <= tolerance]
-    assert (found is None) == (not accurate) and (nearest(candidates) is None) == (not candidates)
+    study = Study(Request("bar", tolerance=tolerance), {})
+    study.rows = [Row({}, "ok", seconds=[p[0]], in_time=Error(0.0, p[1]), in_time_sure=Error(0.0, 0.0)) for p in candidates]
+    found, nearest, accurate = study.cheapest(), study.nearest(), [p for p in candidates if p[1] <= tolerance]
+    assert (found is None) == (not accurate) and (nearest is None) == (not candidates)
     if accurate:
-        assert candidates[found] == min(accurate)
+        assert study.point(found) == min(accurate)
     if candidates:
-        assert candidates[nearest(candidates)] == min(candidates, key=lambda p: (p[1], p[0]))
+        assert study.point(nearest) == min(candidates, key=lambda p: (p[1], p[0]))
 
 
 def test_points_with_nan_are_left_out():
-    candidates = [(math.nan, 0.0), (1.0, math.nan), (2.0, 0.5)]
-    assert front(candidates) == [2] and cheapest(candidates, 1.0) == 2 and front([]) == []
+    assert front([(math.nan, 0.0), (1.0, math.nan), (2.0, 0.5)]) == [2] and front([]) == []

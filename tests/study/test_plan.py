@@ -18,7 +18,7 @@ from taisoft.cli.study import values_of
 from taisoft.errors import SceneError
 from taisoft.scene.refine import refined, with_order
 from taisoft.study import AXES, Setting
-from taisoft.study.plan import complete, expand, frame_time, make_plan
+from taisoft.study.plan import Planner, complete, expand, frame_time
 from taisoft.study.runner import Task, steps_in, tasks_of
 from tests.cli.command import write
 from tests.fem.shells import inside, thick_sphere
@@ -114,7 +114,7 @@ def plan_of(scene: ts.Scene, axes: dict, solver: dict | None = None, **request) 
             made = refined(made)
         return made if order is None else with_order(made, order)
 
-    return make_plan(variant, solver or {}, REQUEST | {"axes": axes} | request)
+    return Planner(variant, solver or {}, REQUEST | {"axes": axes} | request).plan()
 
 
 def test_settings_that_cannot_be_run_stay_in_the_list_with_the_reason():
