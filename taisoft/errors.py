@@ -44,12 +44,14 @@ def reworded(
 
 @contextmanager
 def collected_warnings() -> Iterator[list[str]]:
-    """Yield a list that holds the distinct texts of the block's UserWarnings at its end; none is shown."""
+    """Yield a list that holds the distinct texts of the block's UserWarnings at its end; others are shown after it."""
     texts: list[str] = []
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", UserWarning)
         yield texts
     texts += dict.fromkeys(str(one.message) for one in caught if issubclass(one.category, UserWarning))
+    for one in (one for one in caught if not issubclass(one.category, UserWarning)):
+        warnings.warn_explicit(one.message, one.category, one.filename, one.lineno)
 
 
 def no_memory(what: str, error: MemoryError) -> SimulationError:
