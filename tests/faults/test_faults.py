@@ -109,7 +109,8 @@ def test_failing_calls(beam, tmp_path, shim):
     lines = error_lines(err)
     assert all(line.startswith(start) and re.search(rf"(: Read-only file system| {usd})$", line) for line in lines), lines
     lost = [re.match(r"(?:\w+/)?([\w.]+)", line.removeprefix(start))[1] for line in lines]
-    assert sorted(lost) == ["00002.png", "checkpoint.npz", "points_00002.usdc", "steps.csv"]
+    # the thread that writes pictures may meet the disk before or after the state's
+    assert sorted({*lost} - {"00002.png"}) == ["00002.npz", "checkpoint.npz", "points_00002.usdc", "steps.csv"]
     assert [path.name for path in sorted((out / "frames").iterdir())] == ["00000.png", "00001.png"]
     assert read_checkpoint(out / "checkpoint.npz").state["simulation"]["time"] == pytest.approx(1 / 30)
     for picture in (out / "frames").glob("*.png"):
@@ -253,9 +254,9 @@ def test_hostile_environment(tmp_path, shim):
     point, jump = re.match(r"point (.) jump (\S+)\n", done.stdout).groups()
     assert float(jump) > 1e4 and point == ("," if commas else ".")
     plain, hostile = ({f.relative_to(out): f for f in out.rglob("*.*")} for out in (tmp_path / "plain", tmp_path / "hostile"))
-    assert set(plain) == set(hostile) and len(plain) == 4
+    assert set(plain) == set(hostile) and len(plain) == 4 + 5  # with the states of four frames
     for name in plain:
-        if name.suffix == ".csv":
+        if name.suffix == ".csv" or name.parts[0] == "states":
             assert plain[name].read_bytes() == hostile[name].read_bytes(), name
     stages = [Sdf.Layer.OpenAsAnonymous(str(files[Path("scene.usdc")])).ExportToString() for files in (plain, hostile)]
     assert stages[0] == stages[1] and "vonMisesStress" in stages[0]

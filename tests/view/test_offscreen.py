@@ -275,21 +275,23 @@ def test_a_process_has_one_window_which_leaves_no_files(tmp_path, monkeypatch):
 @needs_vulkan
 def test_the_window_blends_transparent_surfaces_from_far_to_near():
     """As pictures do, to a few pixels, in whatever order the bodies were added."""
-    for scene in (walls(0.5), walls(0.5)):
+    scenes = walls(0.5), walls(0.5)
+    scenes[1].bodies.reverse()
+    for scene in scenes:
         drawing = Offscreen(scene, SIZE, FRONT)
         state = sampled(FakeSimulator(scene))
         x, normals = drawing.surfaces.with_obstacles(drawing.surfaces.of_bodies(state), state, FRONT.position)
         colours, lines = lit_colours(x, normals, drawing.surfaces.colours, FRONT), (np.zeros((0, 3)), np.zeros((0, 3)))
         canvas = Canvas(drawing.surfaces, SIZE, visible=False)
         try:
-            canvas.draw(x, colours, FRONT, (1, 1, 1), lines)
-            shown = canvas.pixels(0, 0, *SIZE).astype(int)
+            for _ in range(2):  # the first picture of a window may be empty
+                canvas.draw(x, colours, FRONT, (1, 1, 1), lines)
+                shown = canvas.pixels(0, 0, *SIZE).astype(int)
         finally:
             canvas.close()
         expected = drawing.image(state)
         middle = slice(SIZE[1] // 2 - 10, SIZE[1] // 2 + 5), slice(SIZE[0] // 4, 3 * SIZE[0] // 4)
         assert (np.abs(shown - expected)[middle].max(axis=2) > 8).mean() < 0.03
-        scene.bodies.reverse()
 
 
 @needs_vulkan
