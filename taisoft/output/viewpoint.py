@@ -171,7 +171,10 @@ class Viewpoint:
         size, free: as for `framing`. The target moves towards what left, only so far that all that was seen stays in view: the
         camera depends on where it is alone. It never moves nearer; points that are not finite are ignored.
         """
-        local, (aim, half) = (points - self.target) @ self.axes.T, self._slopes(free, size, 1.0 - BORDER)
+        aim, half = self._slopes(free, size, 1.0 - BORDER)
+        if limit <= self.distance:
+            return replace(self, shift=tuple(aim))
+        local = (points - self.target) @ self.axes.T
         local = local[np.isfinite(local).all(axis=1)]
         x, depth, seen = local[:, :2], local[:, 2:], half * self.distance
         low, high = (
@@ -197,20 +200,21 @@ class Viewpoint:
 
         size: width and height of the picture. New vertices follow the given ones; triangles that are not finite are dropped.
         """
-        right, up, depth = (np.where(np.isfinite(x), x, np.nan) - self.position).dot(self.axes.T).T
-        half_height = GUARD_BAND * self.slope * depth
-        half_width = half_height * size[0] / size[1]
-        near = depth - self.clipping[0] * (1.0 + 1e-6)
-        planes = [near, half_width - right, half_width + right, half_height - up, half_height + up]
-        if all((plane > 0).all() for plane in planes):
+        with np.errstate(invalid="ignore", over="ignore"):
+            right, up, depth = self.axes @ (x - self.position).T
+            half_height = GUARD_BAND * self.slope * depth
+            half_width = half_height * size[0] / size[1]
+            near = depth - self.clipping[0] * (1.0 + 1e-6)
+            inside = np.stack([near, half_width - right, half_width + right, half_height - up, half_height + up])
+            outside = ~((inside > 0.0) & (inside < np.inf)).all(axis=0)  # of some plane's inner side, or not finite
+        if not outside.any():
             return x, triangles, attributes
-        inside = np.stack(planes, axis=1)  # positive on each plane's inner side
-        with np.errstate(invalid="ignore"):
-            within = inside[triangles] > 0  # (t, corners, planes)
-        whole = within.all(axis=(1, 2))
-        crossing = within.any(axis=1).all(axis=1) & ~whole & np.isfinite(inside[triangles]).all(axis=(1, 2))
+        inside, touched = inside.T, outside[triangles].any(axis=1)
+        whole, cut = triangles[~touched], triangles[touched]
+        within = inside[cut] > 0.0  # (t, corners, planes)
+        crossing = within.any(axis=1).all(axis=1) & np.isfinite(inside[cut]).all(axis=(1, 2))
         faces, points = [], []
-        for corners in triangles[crossing]:
+        for corners in cut[crossing]:
             polygon = np.concatenate([inside[corners], x[corners], attributes[corners]], axis=1)
             for k in range(inside.shape[1]):
                 polygon = clip_polygon(polygon, k)
@@ -218,10 +222,10 @@ class Viewpoint:
             faces += [(first, first + k, first + k + 1) for k in range(1, len(polygon) - 1)]
             points += [row[inside.shape[1] :] for row in polygon]
         if not faces:
-            return x, triangles[whole], attributes
+            return x, whole, attributes
         new = np.array(points)
         attributes = np.concatenate([attributes, new[:, 3:]])
-        return np.concatenate([x, new[:, :3]]), np.concatenate([triangles[whole], faces]), attributes
+        return np.concatenate([x, new[:, :3]]), np.concatenate([whole, faces]), attributes
 
     def clipped_lines(self, ends: np.ndarray, colours: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Clip lines, ends (2k,3) [m] and colours (2k,3), at the near plane; lines that are not finite are dropped."""

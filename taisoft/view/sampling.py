@@ -31,14 +31,18 @@ class Sampler:
             step = -(-len(ends) // MAX_SEGMENTS)
             self._ends, self._line = ends[::step], line[::step]
 
-    def state(self, sim, layers: Iterable[str] = (), kinds: Iterable[str] = ()) -> DrawnState:
-        """Return sim's present state, with what visible layers and colours show. Raises OutputError if a path fails."""
+    def state(self, sim, layers: Iterable[str] = (), kinds: Iterable[str] = (), energies: bool = True) -> DrawnState:
+        """Return sim's present state, with what visible layers and colours show; energies: for a caption, or the window.
+
+        Raises OutputError if a path fails.
+        """
         x, scene, time = sim.positions(), sim.scene, sim.time
         with np.errstate(over="ignore", invalid="ignore"):
             state = DrawnState(self.drawn, time, (x - self.drawn.start).astype(np.float32), sim.step_count)
         state.values = {kind: self._values(kind, sim).astype(np.float32) for kind in kinds if kind != "body"}
-        energies = sim.energies()
-        state.energies = {name: float(getattr(energies, name)) for name in ENERGIES}
+        if energies:
+            found = sim.energies()
+            state.energies = {name: float(getattr(found, name)) for name in ENERGIES}
         with reworded((SceneError, SimulationError), "the scene cannot be shown: ", raised=OutputError):
             state.poses = {one.name: one.pose(time) for one in scene.obstacles if one.path is not None}
             if "tractions" in layers:

@@ -78,7 +78,7 @@ class SceneView:
         if isinstance(sim, DrawnState):
             return sim
         visible = [name for name, shown in self.layers.shown.items() if shown]
-        return self._sampler.state(sim, visible, [self.colouring.kind])
+        return self._sampler.state(sim, visible, [self.colouring.kind], energies=False)
 
     def _drawn(self, state: DrawnState, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray, tuple[np.ndarray, np.ndarray]]:
         """Move the camera if needed; return vertices and lit colours (n,3), and the lines of the layers."""
