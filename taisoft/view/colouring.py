@@ -80,12 +80,15 @@ class Colouring:
     def fix(self, states: Iterable[DrawnState], end: float | None = None) -> None:
         """Keep one scale from now on, up to this end, or for the largest values in these states."""
         if self.kind != "body":
-            largest = max(MIN_SPAN[self.kind], *map(self._largest, states)) if end is None else 0.0
+            largest = max(MIN_SPAN[self.kind], *(self._largest(self._above(state)) for state in states)) if end is None else 0.0
             self.span, self._is_fixed = round_up(largest) if end is None else end - self.low, True
 
-    def _largest(self, state: DrawnState) -> float:
-        """Return the quantile of a state's values above the scale's lower end."""
-        above = state.values[self.kind].astype(np.float64) - self.low
+    def _above(self, state: DrawnState) -> np.ndarray:
+        """Return a state's values (n,) above the scale's lower end."""
+        return state.values[self.kind].astype(np.float64) - self.low
+
+    def _largest(self, above: np.ndarray) -> float:
+        """Return the quantile of values (n,) above the scale's lower end."""
         finite = above[np.isfinite(above) & ((above > 0.0) | (self.kind not in POSITIVE))]
         return float(np.quantile(finite, QUANTILE)) if len(finite) else 0.0
 
@@ -102,8 +105,8 @@ class Colouring:
         """Return unshaded colours (n,3) of all drawn vertices, sRGB; the bodies' own as long as the quantity is not known."""
         if self.kind not in state.values:
             return self._surfaces.colours
-        above = state.values[self.kind].astype(np.float64) - self.low
-        self._peak = max(self._largest(state), DECAY * self._peak, MIN_SPAN[self.kind])
+        above = self._above(state)
+        self._peak = max(self._largest(above), DECAY * self._peak, MIN_SPAN[self.kind])
         if not self._is_fixed and (self._peak > self.span or round_up(LOWER_MARGIN * self._peak) < self.span):
             self.span = round_up(self._peak)
         colours = colours_of(np.nan_to_num(above / self.span))

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import taisoft as ts
+from taisoft.mesh.placing import FROM_Y_UP
 from taisoft.output.viewpoint import Viewpoint
 from taisoft.scene.fingerprint import scene_digest
 from taisoft.scene.numbers import set_numbers
@@ -107,3 +108,25 @@ def test_a_camera_passes_its_key_frames_turning_about_its_target():
 def test_bad_looks_are_refused(make, message):
     with pytest.raises(ts.SceneError, match=message):
         make()
+
+
+@pytest.mark.parametrize("up", ["y", "z"])
+def test_a_camera_passes_through_its_key_frames_the_short_way_around_its_target(up):
+    """Before and after them it stays."""
+    turn, eyes = FROM_Y_UP[up], np.array([(1.0, 1, -3), (-1, 1, -3), (-1, 2, -6)])
+    camera = ts.Camera(eyes @ turn.T, (0, 1, 0) @ turn.T, fov=[40, 20, 20], times=[0, 1, 3])
+    at = [Viewpoint(**camera.at(t, up)) for t in (-1.0, 0.0, 0.5, 1.0, 3.0, 9.0)]
+    before, first, between, second, last, after = at
+    for one, eye in ((before, 0), (first, 0), (second, 1), (last, 2), (after, 2)):
+        assert np.allclose(one.position, turn @ eyes[eye]) and np.allclose(one.target, turn @ (0, 1, 0))
+    assert 20 < between.fov < 40 and before.fov == pytest.approx(40) and after.fov == pytest.approx(20)
+    sideways, _, back = between.position @ turn
+    assert abs(sideways) < 0.5 and back == pytest.approx(-np.sqrt(10), abs=0.2), "behind the target, not in front of it"
+
+
+def test_zoom_enlarges_the_picture():
+    camera = ts.Camera((0, 0, 5), fov=[40, 20], times=[0, 1], follow="ball")
+    near = camera.zoom(2.0)
+    assert np.allclose(np.tan(np.radians(near.fov) / 2), np.tan(np.radians(camera.fov) / 2) / 2) and near.follow == "ball"
+    with pytest.raises(ts.SceneError, match="camera: zoom must be greater than 0"):
+        camera.zoom(0.0)
