@@ -4,13 +4,14 @@ import json
 from argparse import Namespace
 from contextlib import closing, suppress
 from dataclasses import replace
+from itertools import takewhile
 from pathlib import Path
 
 from taisoft.cli import EXIT_SIGNAL, Signals
 from taisoft.cli.pictures import camera_of, picture_options, slowness
 from taisoft.cli.recording import has_bar, make_video
 from taisoft.errors import OutputError, SceneError, reworded
-from taisoft.output.files import DRAWN_NAME, OutputFolder
+from taisoft.output.files import CHECKPOINT_NAME, DRAWN_NAME, OutputFolder
 from taisoft.output.frames import FRAMES_NAME, VIDEO_NAME
 from taisoft.output.report import frame_rate
 from taisoft.scene import checks
@@ -18,7 +19,7 @@ from taisoft.scene.tables import Table
 from taisoft.scene.toml import TOP_KEYS, parsed
 from taisoft.scene.toml_look import read_look
 from taisoft.view.pictures import picture_writer
-from taisoft.view.states import StoredRun
+from taisoft.view.states import STATES_NAME, StoredRun
 
 
 def draw(arguments: Namespace) -> int:
@@ -26,11 +27,11 @@ def draw(arguments: Namespace) -> int:
     with Signals("ending with the pictures drawn so far") as signals:
         with reworded(OutputError, raised=SceneError):
             run, out = StoredRun(arguments.scene), Path(arguments.out or Path(arguments.scene) / DRAWN_NAME)
-            options, slow = picture_options(arguments), slowness(arguments)
-            run.check_colour(options.colour)
+            options, slow = picture_options(arguments, name=run.name), slowness(arguments)
             fps = frame_rate(run.folder) if arguments.video else 0.0
-        if out.resolve() == run.folder.resolve():
-            raise SceneError(f"--out {out}: it is the folder of the run itself; without --out it is {run.folder / DRAWN_NAME}")
+            run.state(run.frames[0], options.colour)
+        if any((out / name).exists() for name in (STATES_NAME, CHECKPOINT_NAME, "report.json")):
+            raise SceneError(f"--out {out}: it is the folder of a run; without --out it is {run.folder / DRAWN_NAME}")
         _set_look(run, arguments)
         scale = None if arguments.scale is None else checks.number(arguments.scale, "--scale", above=0.0)
         if scale is not None and options.colour == "body":
@@ -38,14 +39,12 @@ def draw(arguments: Namespace) -> int:
         with closing(OutputFolder(out, arguments.overwrite)) as folder:
             signals.run_began()
             writer = picture_writer(folder.path, run.scene, replace(options, bar=has_bar(options.colour)))
-            writer.renderer.colouring.fix(map(run.state, run.frames), scale)
-            drawn = 0
+            wanted, drawn = takewhile(lambda _: not signals.requested(), run.frames), 0
+            writer.renderer.colouring.fix((run.state(index, options.colour) for index in wanted), scale)
             with closing(writer):
-                for index in run.frames:
-                    writer.frame(run.state(index), index)
+                for index in takewhile(lambda _: not signals.requested(), run.frames):
+                    writer.frame(run.state(index, options.colour), index)
                     drawn += 1
-                    if signals.requested():
-                        break
             if arguments.video and not signals.requested():
                 make_video(folder.path, fps / slow)
             folder.discard_stale()
@@ -69,6 +68,8 @@ def _set_look(run: StoredRun, arguments: Namespace) -> None:
         with suppress(ValueError):
             value = json.loads(text)
         with reworded(SceneError, f"--set {assignment}: "):
+            if value is None:
+                raise SceneError("there is no value")
             if name == "scene.background":
                 run.background = value
             elif equals and owner and key in ("colour", "opacity"):

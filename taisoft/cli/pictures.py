@@ -16,15 +16,18 @@ from taisoft.view.pictures import PictureOptions
 from taisoft.view.scene_view import IN_PICTURES, LAYERS
 
 
-def picture_options(arguments: Namespace, plots: tuple[str, ...] = ()) -> PictureOptions:
-    """Return what the given options say of pictures. Raises SceneError for a value that is none, and without needed packages."""
+def picture_options(arguments: Namespace, plots: tuple[str, ...] = (), name: str | None = None) -> PictureOptions:
+    """Return what the given options say of pictures. name: of the scene, by default its file's.
+
+    Raises SceneError for a value that is none, and without needed packages.
+    """
     if arguments.view is not None and arguments.camera is not None:
         raise SceneError("--view gives the automatic camera's direction, so it excludes --camera")
     if (plots or arguments.caption) and text_missing():
         raise SceneError(f"{'--plots' if plots else '--caption'}: {text_missing()}")
     layers, size = names_of("layers", arguments.layers, LAYERS), SIZE if arguments.size is None else _size_of(arguments.size)
     drawn = {"colour": arguments.colour, "layers": IN_PICTURES if layers is None else layers, "plots": plots}
-    caption = Path(arguments.scene).stem if arguments.caption else None
+    caption = (name or Path(arguments.scene).stem) if arguments.caption else None
     return PictureOptions(**drawn, caption=caption, size=size, view=_view_of(arguments.view))
 
 

@@ -15,7 +15,8 @@ from taisoft.nested import to_json
 from taisoft.output.files import RESULT_FILES, RESULT_FOLDERS, CheckpointWriter, OutputFolder
 from taisoft.output.frame_files import VTU_NAME, VtuWriter, cut_pvd
 from taisoft.output.frame_table import FrameTable
-from taisoft.output.frames import FRAMES_NAME, ffmpeg_command, find_ffmpeg, picture_numbers, write_video
+from taisoft.output.frames import FRAMES_NAME, VIDEO_NAME, ffmpeg_command, find_ffmpeg, picture_numbers, write_video
+from taisoft.output.nodal_fields import NodalValues
 from taisoft.output.report import body_records, write_report
 from taisoft.output.usd import UsdWriter
 from taisoft.records import RunReport
@@ -35,7 +36,8 @@ NO_BALLS = "; nodes that follow a path have no balls, since it may release them"
 class DisplayOptions:
     """window, pictures, usd, vtu: whether there is a window, and what is written to the folder; layers: names, or None for the
     defaults; picture: what pictures show; errors: whether they are estimated. details: names, of steps.csv. slow: film time over
-    simulated time. keep: quantities of the states that are kept; None: no states.
+    simulated time. keep: quantities of the states that are kept, none of which means no states; None for those of the run that is
+    resumed, else KEPT.
     """
 
     window: bool
@@ -79,7 +81,6 @@ def display_options(arguments: Namespace, has_window: bool) -> DisplayOptions:
         if given and not errors:
             raise SceneError(f"--{option} error needs --error")
     files, slow, picture = (pictures, not arguments.no_usd, arguments.vtu), slowness(arguments), picture_options(arguments, plots)
-    keep = KEPT if keep is None else keep if arguments.keep.strip() != "none" else None
     return DisplayOptions(has_window, *files, layers, picture, errors, details, slow, keep)
 
 
@@ -114,7 +115,7 @@ class Observers:
                 self.guard(member.frame, sim, index)
             seconds = time.perf_counter() - start - (sim.compile_seconds - compiled)
             self.seconds += seconds
-            self.picture_seconds += seconds if isinstance(member, StateWriter) else 0.0
+            self.picture_seconds += seconds if isinstance(member, StateWriter) and member.members else 0.0
 
     def close(self) -> None:
         """Close all members, last first, even if some fail."""
@@ -152,16 +153,21 @@ class Recording:
         self._checkpoints = CheckpointWriter(self._folder.path, every)
 
     def add_writers(
-        self, observers: Observers, sim, fps: float | None, seconds: float, shown: DisplayOptions, plots: Plots | None
+        self, observers: Observers, sim, name: str, fps: float | None, seconds: float, shown: DisplayOptions, plots: Plots | None
     ) -> None:
-        """Add the writers of pictures, USD, .vtu and checkpoints to the observers of a run that ends at `seconds`.
+        """Add the writers of pictures, USD, .vtu and checkpoints to the observers of a run that ends at `seconds`; name: of its
+        scene.
 
         A resumed run that does not match the earlier files is refused before anything is removed.
         """
-        folder = self._folder.path
+        folder, kept = self._folder.path, tuple(self._notes.get("keep", KEPT))
+        keep, values = kept if shown.keep is None else shown.keep, NodalValues(sim.scene.bodies, by_step=True)
+        if "keep" in self._notes and keep != kept:
+            given, before = (",".join(one) or "none" for one in (keep, kept))
+            raise OutputError(f"--keep {given}: the run that is resumed keeps {before}, so that all its states are alike")
         if shown.usd:
             numbers = {"fps": fps or 1.0 / sim.dt, "self_collision": sim.settings.self_collision}
-            numbers |= {"first": self._first or 0, "errors": shown.errors}
+            numbers |= {"first": self._first or 0, "errors": shown.errors, "values": values}
             usd = UsdWriter(folder, sim.scene, **numbers)
             observers.members.append(usd)
             self._checkpoints.before.append(usd.flush)
@@ -174,7 +180,7 @@ class Recording:
             self._folder.clear(self._first)
         if shown.vtu:
             observers.members.append(VtuWriter(folder, sim.scene, self._first or 0, shown.errors))
-        sampler, pictures = Sampler(sim.scene), None
+        sampler, pictures = Sampler(sim.scene, values), None
         look = digest([to_json([asdict(shown.picture), sampler.drawn.looks()])])
         if shown.pictures:
             if self._first is not None and look != self._notes.get("look", look):
@@ -184,12 +190,13 @@ class Recording:
             options = replace(shown.picture, bar=has_bar(shown.picture.colour), kept=self._notes)
             pictures = open_pictures(folder, sampler.drawn, options, plots, n_pictures)
             self._checkpoints.before.append(pictures.flush)
-        if pictures is not None or shown.keep is not None:
+        if pictures is not None or keep:
             members, looks = [] if pictures is None else [pictures], (shown.picture.layers, shown.picture.colour)
-            states = StateWriter(folder, sampler, shown.keep, members, looks)
+            states = StateWriter(folder, sampler, keep, members, looks, name)
             observers.members.append(states)
             self._checkpoints.before.append(states.flush)
-        self._checkpoints.notes = lambda: {"fps": fps, "look": look} | (pictures.kept(sim.time) if pictures else {})
+        noted = {"fps": fps, "look": look, "keep": list(keep)}
+        self._checkpoints.notes = lambda: noted | (pictures.kept(sim.time) if pictures else {})
         observers.members.append(self._checkpoints)
 
     def checkpoint(self, sim) -> None:
@@ -240,8 +247,10 @@ def has_bar(colour: str) -> bool:
 
 def make_video(folder: Path, fps: float) -> None:
     """Write folder/video.mp4 from the pictures, or print the command if ffmpeg is missing. Raises OutputError."""
-    if not picture_numbers(folder):
+    if not (numbers := picture_numbers(folder)):
         return
+    if len(numbers) <= max(numbers) - min(numbers):
+        raise OutputError(f"{folder / VIDEO_NAME} cannot be made: pictures are missing between {min(numbers)} and {max(numbers)}")
     if find_ffmpeg() is None:
         line = shlex.join(ffmpeg_command(folder, fps))
         print(f"taisoft: no video without ffmpeg (pip install 'taisoft[video]'); the command is: {line}", file=sys.stderr)

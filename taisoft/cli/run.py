@@ -274,7 +274,7 @@ def _run(sim, settings: RunSettings, arguments, signals, warned: list[str], save
 
             observers.members.append(LiveWindow(sim, colour=shown.picture.colour, layers=shown.in_window))
         if recording is not None:
-            recording.add_writers(observers, sim, settings.fps, settings.seconds, shown, plots)
+            recording.add_writers(observers, sim, Path(arguments.scene).stem, settings.fps, settings.seconds, shown, plots)
         progress = Progress(settings.seconds, label=Path(arguments.scene).stem)
         observers.members.append(progress)
         if shown.errors:

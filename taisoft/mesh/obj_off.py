@@ -48,11 +48,11 @@ def read_obj(name: str, data: bytes) -> tuple[np.ndarray, list[np.ndarray], list
                         members[kind].setdefault(called, []).append(len(polygons))
                 polygons.append(np.array([[k - 1 if k > 0 else len(points) + k for k in corners]]))
                 given = of_texture[0] if of_texture else (n + 1,) * len(corners)
-                rows.append(np.array([[k - 1 if k > 0 else len(texture) + k for k in given]]))
+                rows.append([k - 1 if k > 0 else len(texture) + k for k in given] if n else ())
         except ValueError:
             raise MeshError(f"{name}: line {number}: expected {RULES[words[0]]}, not {one_line(' '.join(words))!r}") from None
     table = np.array([*texture, (np.nan, np.nan)])
-    uvs = [table[one] for one in rows] if any(one.min() < n for one in rows) else None
+    uvs = [table[[one]] for one in rows] if any(one and min(one) < n for one in rows) else None
     return np.array(points, dtype=np.float64).reshape(-1, 3), polygons, uvs, next((of for of in members.values() if of), {})
 
 

@@ -12,20 +12,14 @@ import numpy as np
 from taisoft.errors import MeshError, value_text
 from taisoft.mesh.sdf import Triangles
 from taisoft.mesh.topology import HALF_EDGES, linked_groups, normals_and_heights
+from taisoft.scene.checks import array
 
 CHUNK = 128  # triangles that get UVs at once, each with some hundred triangles of the source near it
 
 
 def checked_uvs(uvs, n: int, error: Callable[[str], MeshError]) -> np.ndarray | None:
     """Return a copy of UVs (n,3,2) float64 of n triangles, or None for None. error: makes an error of its text."""
-    if uvs is None:
-        return None
-    array = np.array(uvs)
-    if array.shape != (n, 3, 2) or array.dtype.kind not in "fiu":
-        raise error(f"uvs must be numbers of shape ({n}, 3, 2), two for each corner, not {array.dtype} of shape {array.shape}")
-    if len(bad := np.argwhere(~np.isfinite(array))):
-        raise error(f"uvs of triangle {bad[0, 0]}, corner {bad[0, 1]} are not finite")
-    return array.astype(np.float64)
+    return None if uvs is None else array(uvs, "uvs", ((n, 3, 2),), error)
 
 
 def checked_subsets(subsets, n: int, error: Callable[[str], MeshError]) -> dict[str, np.ndarray]:

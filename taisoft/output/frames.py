@@ -43,7 +43,7 @@ class FrameWriter:
         picture = self.renderer.image(state)
         if self._annotate is not None:
             picture = self._annotate(picture, state, index)
-        self._writer.write(self.folder / f"{index:05d}.png", _write_png, picture)
+        self._writer.write(self.folder / f"{index:05d}.png", lambda path: write_bytes(path, png_bytes(picture)))
 
     def flush(self) -> None:
         """Wait until all pictures are written. Raises OutputError."""
@@ -59,10 +59,6 @@ class FrameWriter:
             self._writer.close()
         finally:
             self.renderer.close()
-
-
-def _write_png(path: Path, picture: np.ndarray) -> None:
-    write_bytes(path, png_bytes(picture))
 
 
 def png_bytes(image: np.ndarray, level: int = COMPRESSION) -> bytes:

@@ -9,10 +9,16 @@ corners come out lower than in the tets, and the chequerboard stresses of lockin
 mean is first-order accurate.
 """
 
+from functools import cached_property
+
 import numpy as np
 import scipy.sparse as sp
 
+from taisoft.fem.reference import inverse_rest_edges
+from taisoft.scene.rigid import RigidBody
+
 VECTORS = ("traction", "slip")  # of `ContactPressure`
+OF_CONTACTS = {"pressure": "pressure", "slip": "accumulated_slip"}  # quantity -> field of `ContactPressure`
 UNKNOWN_ERROR = -1.0  # in files, of nodes whose error is unknown
 
 
@@ -77,3 +83,44 @@ def von_mises(sigma: np.ndarray) -> np.ndarray:
     """Return the von Mises stress (...,) [Pa] of stresses (..., 3, 3) [Pa]: 0 for pure pressure, |s| for uniaxial tension s."""
     deviator = sigma - np.trace(sigma, axis1=-2, axis2=-1)[..., None, None] / 3.0 * np.eye(3)
     return np.sqrt(1.5 * np.einsum("...ij,...ij->...", deviator, deviator))
+
+
+class NodalValues:
+    """A quantity at the nodes of all bodies. bodies: of the scene, in the order added.
+
+    by_step: stress is computed once a step, for several writers of one run.
+    """
+
+    def __init__(self, bodies, by_step: bool = False):
+        self._bodies, self._by_step, self._stress = bodies, by_step, (None, np.empty(0))  # with the number of its step
+        self._rigid = np.concatenate([np.full(body.n_nodes, isinstance(body, RigidBody)) for body in bodies])
+
+    def __call__(self, kind: str, sim) -> np.ndarray:
+        """Return the quantity, such as "stress" or "speed", at all nodes (n_nodes,) in sim's present state."""
+        if kind == "stress":
+            if not self._by_step or self._stress[0] != sim.step_count:
+                found = von_mises(self._mean(sim.stress()))
+                self._stress = sim.step_count, np.where(self._rigid, np.nan, found)  # a rigid body's tet is not its material
+            return self._stress[1]
+        if kind == "error":
+            return sim.nodal_errors()
+        if kind in OF_CONTACTS:
+            return surface_values(sim, OF_CONTACTS[kind])[0]
+        return self._mean(self._stretches(sim)) if kind == "stretch" else np.linalg.norm(sim.velocities(), axis=1)
+
+    @cached_property
+    def _mean(self) -> NodalMean:
+        return NodalMean(self._bodies)
+
+    @cached_property
+    def _Dm_inv(self) -> list[np.ndarray]:
+        return [inverse_rest_edges(b.mesh.vertices, b.mesh.tets)[0] for b in self._bodies]
+
+    def _stretches(self, sim) -> np.ndarray:
+        """Return the largest principal stretch of every tet (m,); for quadratic tets that of the linear tet of the corners."""
+        parts = []
+        for body, Dm_inv in zip(self._bodies, self._Dm_inv):
+            corner = sim.positions(body.name)[body.mesh.tets]
+            F = (corner[:, 1:] - corner[:, :1]).transpose(0, 2, 1) @ Dm_inv
+            parts.append(np.sqrt(np.linalg.eigvalsh(F.transpose(0, 2, 1) @ F)[:, 2]))
+        return np.concatenate(parts)

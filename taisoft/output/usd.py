@@ -28,7 +28,7 @@ from taisoft.errors import OutputError
 from taisoft.files import replacing
 from taisoft.mesh.usd_content import usd_message
 from taisoft.output.files import make_folder, output_errors
-from taisoft.output.nodal_fields import UNKNOWN_ERROR, NodalMean, von_mises
+from taisoft.output.nodal_fields import UNKNOWN_ERROR, NodalValues
 from taisoft.output.usd_curves import TENSION
 from taisoft.output.usd_scene import OF_CAMERA, scene_layer
 from taisoft.output.usd_surface import ERROR, IMPULSE, NORMALS, ROOT, STRESS, VELOCITIES
@@ -46,7 +46,8 @@ class UsdWriter:
     folder: the run's folder; scene: its meshes and names are read at construction; fps: frames per second of simulated time
     [1/s]; chunk_frames: frames per chunk, the most that are lost if the process is killed; self_collision: the simulator's
     setting, which decides with the scene whether there can be contacts; first: number of the first frame of a resumed run;
-    earlier frames are copied from the folder; errors: whether the run estimates errors. Raises OutputError, also if an obstacle's
+    earlier frames are copied from the folder; errors: whether the run estimates errors; values: of its nodes, which
+    writers may share. Raises OutputError, also if an obstacle's
     path fails or the folder holds another scene or frame rate.
     """
 
@@ -59,6 +60,7 @@ class UsdWriter:
         self_collision: bool = False,
         first: int = 0,
         errors: bool = False,
+        values: NodalValues | None = None,
     ):
         if not fps > 0:
             raise OutputError(f"USD export: fps is {fps}; it must be positive")
@@ -69,7 +71,7 @@ class UsdWriter:
         self.chunk_frames = chunk_frames
         self._touching, self._errors = scene.pushes(self_collision), errors
         self._tracks, self._obstacles, self._curves, self._view, self._template = scene_layer(scene, fps, self._touching, errors)
-        self._mean = NodalMean(scene.bodies)
+        self._values = values or NodalValues(scene.bodies)
         self._chunk, self._moved = None, set()  # tracks of the obstacles that have moved
         self._codes: list[float] = []  # time codes in the unfinished chunk
         self._fps, self._start, self._latest = fps, 0.0, float(first - 1)  # start: time of frame 0 [s]; latest: time code
@@ -108,7 +110,7 @@ class UsdWriter:
         if self._chunk is None:
             self._chunk = Sdf.Layer.CreateAnonymous(".usdc")
             self._chunk.TransferContent(self._template)
-        fields = {STRESS: von_mises(self._mean(sim.stress())), VELOCITIES: sim.velocities()}
+        fields = {STRESS: np.nan_to_num(self._values("stress", sim)), VELOCITIES: sim.velocities()}
         if self._touching:
             fields[IMPULSE] = nodal_impulses(sim.contacts(), len(x))
         if self._errors:

@@ -73,9 +73,11 @@ class ViewTrack:
         return self._camera.position
 
     def resume(self, transform: np.ndarray) -> None:
-        """Start from the camera's last transform (4,4)."""
-        right, up, back = self._camera.axes @ (transform[3, :3] - self._camera.target)
-        self._move(self._camera.target + (right, up) @ self._camera.axes[:2], -back)
+        """Start from the camera's last transform (4,4), if that was one of the automatic camera."""
+        axes = self._camera.axes
+        right, up, back = axes @ (transform[3, :3] - self._camera.target)
+        if np.allclose(transform[:3, :3], axes * [[1.0], [1.0], [-1.0]]):
+            self._move(self._camera.target + (right, up) @ axes[:2], -back)
 
     def samples(self, t: float, x: np.ndarray) -> list[tuple]:
         """Return (path, value) of each attribute at time t [s], with nodes at x (n,3) [m].

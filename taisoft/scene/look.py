@@ -65,6 +65,14 @@ def check_follow(camera: "Camera | None", bodies) -> "Camera | None":
     return camera
 
 
+def _depth(value) -> int:
+    """Return the number of dimensions of a value that should be an array; 0 if it is none."""
+    try:
+        return np.ndim(value)
+    except ValueError:
+        return 0
+
+
 @guarded_record("light", "make a new Light")
 class Light:
     """Light from far away, of a scene's `lights`. Raises SceneError."""
@@ -94,13 +102,13 @@ class Camera:
     follow: str | None = None  #: name of a body with whose mean displacement the camera moves along
 
     def __post_init__(self):
-        varying = (("position", 1), ("target", 1), ("fov", 0))
-        if self.times is None and any(np.ndim(getattr(self, name)) > least for name, least in varying):
+        varying = (self.position, 1), (self.target, 1), (self.fov, 0)
+        if self.times is None and any(_depth(value) > least for value, least in varying):
             raise SceneError("camera: key frames of position, target or fov need times [s]")
         times = None if self.times is None else checks.times(self.times, "camera: times")
         k = () if times is None else (len(times),)
-        shapes = {"position": ((3,), (*k, 3)), "target": ((3,), (*k, 3)), "fov": ((), k)}
-        values = {name: checks.array(getattr(self, name), f"camera: {name}", ones) for name, ones in shapes.items()}
+        shapes = {"position": {(3,), (*k, 3)}, "target": {(3,), (*k, 3)}, "fov": {(), k}}
+        values = {name: checks.array(getattr(self, name), f"camera: {name}", (*sorted(ones),)) for name, ones in shapes.items()}
         if ((values["fov"] < 1.0) | (values["fov"] > 120.0)).any():
             raise SceneError(f"camera: fov must be from 1 to 120 degrees, not {value_text(self.fov)}")
         offsets = np.atleast_2d(values["position"] - values["target"])
@@ -118,7 +126,7 @@ class Camera:
         """Return the camera with a narrower field of view, so that everything looks this many times as large."""
         factor = checks.number(factor, "camera: zoom", above=0.0)
         fov = 2.0 * np.degrees(np.arctan(np.tan(np.radians(self.fov) / 2.0) / factor))
-        return Camera(self.position, self.target, self.up, fov, self.times, self.follow)
+        return Camera(self.position, self.target, self.up, fov if np.ndim(fov) else float(fov), self.times, self.follow)
 
     def at(self, t: float, up: str) -> dict:
         """Return target (3,) [m], distance [m], azimuth, elevation and fov [deg], and up at time t [s], but without following.

@@ -144,14 +144,14 @@ def round_up(value: float) -> float:
     return next((k * power for k in (1.0, 2.0, 5.0) if k * power >= value * (1.0 - 1e-12)), 10.0 * power)
 
 
-def lit_colours(x: np.ndarray, normals: np.ndarray, base: np.ndarray, camera: Viewpoint, lights=None) -> np.ndarray:
+def lit_colours(x: np.ndarray, normals: np.ndarray, base: np.ndarray, camera: Viewpoint, lights=None, up=None) -> np.ndarray:
     """Return shaded colours (n,3) in [0, 1] of vertices x (n,3) with unit normals (n,3) and base colours (n,3) for a camera.
 
-    lights: of the scene, or None for the lamps of the camera.
+    lights: of the scene, or None for the lamps of the camera; up: axis of the scene, from which the sky shines, None for the
+    camera's.
     """
-    right, up, forward = camera.axes
-    frame = np.array([right, up, -forward])
-    light = GROUND + (SKY - GROUND) * (0.5 + 0.5 * normals @ UP[camera.up])[:, None]
+    frame = camera.axes * [[1.0], [1.0], [-1.0]]
+    light = GROUND + (SKY - GROUND) * (0.5 + 0.5 * normals @ UP[up or camera.up])[:, None]
     if lights is None:
         lamps = [((lamp / np.linalg.norm(lamp)) @ frame, strength) for lamp, strength in LAMPS]
     else:

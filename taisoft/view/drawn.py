@@ -130,7 +130,7 @@ class DrawnScene:
         return drawn
 
     def plain(self) -> dict:
-        """Return it as plain data: nested dicts and lists of numbers, texts and arrays. Raises OutputError if a path fails."""
+        """Return it as plain data: nested dicts and lists of numbers, texts and arrays."""
         given = {name: value for name, value in _fields(self).items() if name not in ("rows", "start", "size")}
         return given | {
             "bodies": [body.plain() for body in self.bodies],

@@ -79,7 +79,8 @@ class Offscreen(SceneView):
     def _present(self) -> dict:
         layers = self.layers
         peaks = {"impulse": layers.peak, "tension": layers.connections.peak, "pressure": layers.pressures.peak}
-        return {"camera": [*self.camera.target.tolist(), self.camera.distance], "scale": list(self.colouring.scale)} | peaks
+        camera = None if self._has_own else [*self.camera.target.tolist(), self.camera.distance]
+        return {"camera": camera, "scale": list(self.colouring.scale)} | peaks
 
     def image(self, sim) -> np.ndarray:
         """Return a picture of a `DrawnState`, or of a simulator's present state, uint8 (height, width, 3), first row on top.

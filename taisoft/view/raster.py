@@ -44,28 +44,20 @@ class Raster:
         self,
         points: np.ndarray,
         triangles: np.ndarray,
-        attributes: np.ndarray,
+        attributes: np.ndarray | None,
         near: float,
         shadows: np.ndarray,
-        picture: np.ndarray,
+        picture: np.ndarray | None,
         opacities: np.ndarray | None = None,
+        depths: np.ndarray | None = None,
     ) -> None:
-        """Draw triangles over a picture, uint8 (height, width, 3) in pixels of SAMPLES x SAMPLES samples.
+        """Draw triangles over a picture, uint8 (height, width, 3) in pixels of SAMPLES x SAMPLES samples, or into depths.
 
         points: (n,3), position in samples from the upper left corner, and depth; triangles: (t,3); attributes: (n,N_ATTRIBUTES)
         of the points, see `shading`. Triangles that reach nearer than `near` or beyond MAX_COORDINATE, or are not finite, are
         skipped; both sides are drawn. Of triangles at the same depth the last one is in front. shadows: (maps, v, u), the
         fraction of light that is missing. opacities: (t,), None if all are 1. Raises OutputError for too many triangles.
         """
-        self._draw(points, triangles, attributes, near, shadows, picture, None, opacities)
-
-    def inverse_depths(self, points: np.ndarray, triangles: np.ndarray, near: float = 0.0) -> np.ndarray:
-        """Return 1/depth of all samples (height, width), 0 where no triangle is; arguments as for `draw`."""
-        depths = np.zeros(self.size[::-1])
-        self._draw(points, triangles, None, near, np.zeros((1, 2, 2)), None, depths)
-        return depths
-
-    def _draw(self, points, triangles, attributes, near, shadows, picture, depths, opacities=None) -> None:
         n, n_attributes = len(triangles), 0 if attributes is None else attributes.shape[1]
         if n == 0:
             return
@@ -92,6 +84,12 @@ class Raster:
         images = picture if has_picture else np.zeros((1, 1, 3), np.uint8), depths if has_depths else np.zeros((1, 1))
         sizes = self.size[0], self._columns, has_picture, has_depths
         draw(*sizes, *of_triangles, self._listed, shadows, *images)
+
+    def inverse_depths(self, points: np.ndarray, triangles: np.ndarray, near: float = 0.0) -> np.ndarray:
+        """Return 1/depth of all samples (height, width), 0 where no triangle is; arguments as for `draw`."""
+        depths = np.zeros(self.size[::-1])
+        self.draw(points, triangles, None, near, np.zeros((1, 2, 2)), None, depths=depths)
+        return depths
 
 
 @kernel(cse=False)

@@ -1,29 +1,25 @@
 """Samples of a simulation: what `DrawnState` holds, read from a simulator."""
 
 from collections.abc import Iterable
-from functools import cached_property
 
 import numpy as np
 
 from taisoft.errors import OutputError, SceneError, SimulationError, reworded
-from taisoft.fem.reference import inverse_rest_edges
 from taisoft.output.connection_lines import ConnectionLines
-from taisoft.output.nodal_fields import NodalMean, surface_values, von_mises
+from taisoft.output.nodal_fields import NodalValues
 from taisoft.scene.loads import Cavity, value_at
-from taisoft.scene.rigid import RigidBody
 from taisoft.view.drawn import ENERGIES, DrawnScene, DrawnState, pressing
 
 MAX_SEGMENTS = 400  # of springs and tendons, in all
 MAX_CONTACTS = 1000  # that are drawn
-OF_CONTACTS = {"pressure": "pressure", "slip": "accumulated_slip"}  # quantity -> field of `ContactPressure`
 
 
 class Sampler:
-    """Samples states of the simulations of a scene. drawn: what is drawn of it."""
+    """Samples states of the simulations of a scene. drawn: what is drawn of it; values: of its nodes, which writers may share."""
 
-    def __init__(self, scene):
-        self.drawn, self._scene = DrawnScene.of(scene), scene
-        self._values, self._lines = NodalValues(scene.bodies), None
+    def __init__(self, scene, values: NodalValues | None = None):
+        self.drawn, self._lines = DrawnScene.of(scene), None
+        self._values = values or NodalValues(scene.bodies)
         if scene.has_springs:
             exact = scene.exact_attachments
             self._lines = ConnectionLines(scene, [one for one in scene.connections if one not in exact])
@@ -62,38 +58,3 @@ def _pressure(sim, body, load, key) -> float:
     if isinstance(load, Cavity):
         return float(sim.cavity_pressure(key))
     return float(value_at(load, sim.time, f"body {body.name!r}: pressure {key}"))
-
-
-class NodalValues:
-    """A quantity at the nodes of all bodies. bodies: of the scene, in the order added."""
-
-    def __init__(self, bodies):
-        self._bodies = bodies
-        self._rigid = np.concatenate([np.full(body.n_nodes, isinstance(body, RigidBody)) for body in bodies])
-
-    def __call__(self, kind: str, sim) -> np.ndarray:
-        """Return the quantity, one of UNITS but "body", at all nodes (n_nodes,) in sim's present state."""
-        if kind == "stress":
-            return np.where(self._rigid, np.nan, von_mises(self._mean(sim.stress())))  # a rigid body's tet is not its material
-        if kind == "error":
-            return sim.nodal_errors()
-        if kind in OF_CONTACTS:
-            return surface_values(sim, OF_CONTACTS[kind])[0]
-        return self._mean(self._stretches(sim)) if kind == "stretch" else np.linalg.norm(sim.velocities(), axis=1)
-
-    @cached_property
-    def _mean(self) -> NodalMean:
-        return NodalMean(self._bodies)
-
-    @cached_property
-    def _Dm_inv(self) -> list[np.ndarray]:
-        return [inverse_rest_edges(b.mesh.vertices, b.mesh.tets)[0] for b in self._bodies]
-
-    def _stretches(self, sim) -> np.ndarray:
-        """Return the largest principal stretch of every tet (m,); for quadratic tets that of the linear tet of the corners."""
-        parts = []
-        for body, Dm_inv in zip(self._bodies, self._Dm_inv):
-            corner = sim.positions(body.name)[body.mesh.tets]
-            F = (corner[:, 1:] - corner[:, :1]).transpose(0, 2, 1) @ Dm_inv
-            parts.append(np.sqrt(np.linalg.eigvalsh(F.transpose(0, 2, 1) @ F)[:, 2]))
-        return np.concatenate(parts)

@@ -17,7 +17,8 @@ from taisoft.mesh.topology import triangle_edges
 from taisoft.output.appearance import ObstacleSurface, ShownBodies, body_colours, obstacle_colour, obstacle_surfaces, subdivide
 from taisoft.output.smoothing import smoothing_groups, unit, vertex_normals
 from taisoft.output.viewpoint import MAX_WIDENING, WHOLE, Viewpoint, camera_viewpoint
-from taisoft.scene.look import Camera
+from taisoft.scene import checks
+from taisoft.scene.look import Camera, check_follow
 from taisoft.scene.obstacles import HalfSpace
 from taisoft.view.colouring import Colouring, lit_colours
 from taisoft.view.connection_layer import ConnectionLayer, PressureLayer, arrows
@@ -52,7 +53,8 @@ class SceneView:
     def __init__(self, scene, size: tuple[int, int], camera: Viewpoint | None, colour: str, layers: tuple[str, ...]):
         self._sampler = None if isinstance(scene, DrawnScene) else Sampler(scene)
         self.scene = scene if self._sampler is None else self._sampler.drawn
-        if isinstance(camera, Camera):
+        if camera is not None and not isinstance(camera, Viewpoint):
+            camera = check_follow(checks.instance(camera, "camera", Camera), self.scene.bodies)
             self.scene, camera = replace(self.scene, camera=camera), None
         self._has_own = camera is None and self.scene.camera is not None  # whether the scene's camera is used
         self.camera = camera or camera_viewpoint(self.scene, 0.0, self.scene.start)
@@ -88,7 +90,7 @@ class SceneView:
             self.camera = camera_viewpoint(self.scene, state.time, state.x)
         self.camera = self.camera.widened(bodies[0], size, self._widest, self._free(size))
         x, normals = self.surfaces.with_obstacles(bodies, state, self.camera.position)
-        colours = lit_colours(x, normals, self.colouring.base(state), self.camera, self._lights)
+        colours = lit_colours(x, normals, self.colouring.base(state), self.camera, self._lights, self.scene.up)
         return x, colours, self.layers.lines(state, self.camera)
 
 

@@ -171,7 +171,7 @@ class Screen(SceneView):
         if "frame" in pressed:
             self._frame(drawn, size)
         if "follow" in pressed:
-            self._follows, self._centre, self._widest = not self._follows, None, 0.0
+            self._follows, self._centre, self._widest, self._has_own = not self._follows, None, 0.0, False
             self._note.set("the camera follows the bodies" if self._follows else "the camera stays")
         self._screenshot |= "screenshot" in pressed
 
@@ -205,7 +205,7 @@ class Screen(SceneView):
         if can_drag and not self._canvas.window.is_pressed(ti.ui.CTRL):
             hit = pick(drawn, self.camera, cursor, size)
             if hit is not None:
-                self._widest = 0.0  # a camera that moves back would move the drag's target
+                self._widest, self._has_own = 0.0, False  # a camera that moves would move the drag's target
                 drag = self._drag = MouseDrag(drawn, hit)
                 self._panel.chosen = drag.body
                 self._requests.add("begin_drag", drag.body, drag.nodes, drag.weights, key="begin_drag")

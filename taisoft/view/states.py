@@ -5,7 +5,7 @@
 """
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -36,16 +36,19 @@ DISPLACEMENT, VALUES = "displacement", "values"  # arrays over the nodes; the la
 class StateWriter:
     """Observer that samples every frame once, writes its state to the run's folder, and passes it on.
 
-    kinds: quantities that are kept, besides positions; None: no states are written. members: get `frame(state, index)`; shown:
-    layers and colour that they show. Files are written in a thread; what fails in it raises OutputError at a later call.
+    kinds: quantities that are kept, besides positions; without any no states are written. members: get `frame(state, index)`;
+    shown: layers and colour that they show; name: of the scene. Files are written in a thread; what fails in it raises
+    OutputError at a later call.
     """
 
-    def __init__(self, folder: str | Path, sampler: Sampler, kinds: Sequence[str] | None, members: Sequence, shown: tuple):
-        self._sampler, self._members, self._folder = sampler, members, None if kinds is None else Path(folder) / STATES_NAME
-        self._layers, self._kinds = (shown[0] if kinds is None else LAYERS), list(dict.fromkeys([*(kinds or ()), shown[1]]))
+    def __init__(
+        self, folder: str | Path, sampler: Sampler, kinds: Sequence[str], members: Sequence, shown: tuple, name: str = ""
+    ):
+        self._sampler, self.members, self._folder = sampler, members, Path(folder) / STATES_NAME if kinds else None
+        self._layers, self._kinds = (LAYERS if kinds else shown[0]), list(dict.fromkeys([*kinds, shown[1]]))
         self._writer = BackgroundWriter()
         if self._folder is not None:
-            _write(make_folder(self._folder) / SCENE_NAME, sampler.drawn.plain(), {})
+            _write(make_folder(self._folder) / SCENE_NAME, {"scene": sampler.drawn.plain(), "name": name}, {})
 
     def frame(self, sim, index: int) -> None:
         """Keep sim's present state as frame number index. Raises OutputError."""
@@ -55,7 +58,7 @@ class StateWriter:
             values = {f"{VALUES}/{kind}": one for kind, one in state.values.items()}
             arrays = {DISPLACEMENT: state.displacement} | values
             self._writer.write(self._folder / f"{index:05d}.npz", _write, state.plain(), arrays)
-        for member in self._members:
+        for member in self.members:
             member.frame(state, index)
 
     def flush(self) -> None:
@@ -65,18 +68,18 @@ class StateWriter:
     def close(self) -> None:
         """Write the states that wait, and close the members; a second call does nothing. Raises OutputError."""
         with ExitStack() as stack:
-            for one in (self._writer, *self._members):
+            for one in (self._writer, *self.members):
                 stack.callback(one.close)
 
 
 class StoredRun(Guarded):
     """A run in a folder, drawn again without computing.
 
-    folder: of `taisoft run --out`. frames: numbers of its frames. background, lights, camera: as of a `Scene`, to be set. Raises
-    OutputError if there are no states, or they cannot be read.
+    folder: of `taisoft run --out`. name: of its scene; frames: numbers of its frames. background, lights, camera: as of a
+    `Scene`, to be set. Raises OutputError if there are no states, or they cannot be read.
     """
 
-    _read_only = frozenset(("folder", "frames"))
+    _read_only = frozenset(("folder", "frames", "name"))
 
     def _label(self) -> str:
         return "stored run"
@@ -89,8 +92,8 @@ class StoredRun(Guarded):
             raise OutputError(
                 f"{states}: there are no states of a run, which `taisoft run` keeps with --out, but not with --keep none"
             )
-        with _reading(states / SCENE_NAME):
-            self._scene = DrawnScene.from_plain(_read(states / SCENE_NAME)[0])
+        with _read(states / SCENE_NAME) as (given, _):
+            self._scene, self.name = DrawnScene.from_plain(given["scene"]), str(given["name"])
         self._background, self._lights, self._camera = self._scene.background, self._scene.lights, self._scene.camera
         self._seal(StoredRun.__init__)
 
@@ -116,24 +119,19 @@ class StoredRun(Guarded):
     def __repr__(self) -> str:
         return f"StoredRun({str(self.folder)!r}, {len(self)} frames)"
 
-    def state(self, frame: int) -> DrawnState:
-        """Return the state of a frame, by its number. Raises OutputError."""
-        if frame not in self.frames:
+    def state(self, frame: int, kind: str = "body") -> DrawnState:
+        """Return the state of a frame, by its number, with a quantity at the nodes, one of UNITS. Raises OutputError."""
+        path = self.folder / STATES_NAME / f"{frame!r:0>5}.npz"
+        if not path.exists():
             raise OutputError(f"{self.folder}: there is no frame {frame!r}: they are {self.frames[0]} to {self.frames[-1]}")
-        path = self.folder / STATES_NAME / f"{frame:05d}.npz"
-        with _reading(path):
-            given, arrays = _read(path)
-            values = {name.removeprefix(f"{VALUES}/"): one for name, one in arrays.items() if name.startswith(f"{VALUES}/")}
+        name = f"{VALUES}/{checked_colour(kind)}"
+        with _read(path) as (given, arrays):
+            if kind != "body" and name not in arrays:
+                kept = [one.removeprefix(f"{VALUES}/") for one in arrays if one.startswith(VALUES)]
+                has, again = ", ".join(kept), f"run it again with --keep {','.join([*kept, kind])}"
+                raise OutputError(f"{self.folder}: colour {kind!r} cannot be drawn: frame {frame} has kept {has}; {again}")
+            values = {} if kind == "body" else {kind: arrays[name]}
             return DrawnState(self._scene, displacement=arrays[DISPLACEMENT], values=values, **given)
-
-    def check_colour(self, kind: str) -> str:
-        """Return the name of a colouring. Raises OutputError if it is unknown, or the run has not kept what it needs."""
-        kept = self.state(self.frames[0]).values
-        if checked_colour(kind) != "body" and kind not in kept:
-            has = f"has kept {', '.join(kept)}" if kept else "has kept positions alone"
-            again = f"run it again with --keep {','.join([*kept, kind])}"
-            raise OutputError(f"{self.folder}: colour {kind!r} cannot be drawn: the run {has}; {again}")
-        return kind
 
     def paint(self, name: str, colour=None, opacity: float | None = None) -> None:
         """Give a body or an obstacle another colour or opacity, as of `Scene.add_body`. Raises SceneError."""
@@ -152,19 +150,8 @@ class StoredRun(Guarded):
 
         The automatic camera frames the start, and the scale is the frame's own. Raises OutputError.
         """
-        state = self.state(self.frames[-1] if frame is None else frame)
-        return Offscreen(self.scene, size, camera, self.check_colour(colour)).image(state)
-
-
-@contextmanager
-def _reading(path: Path) -> Iterator[None]:
-    """Turn what NumPy, zipfile and the content of a file raise into an OutputError."""
-    try:
-        yield
-    except TaisoftError:
-        raise
-    except Exception as error:
-        raise OutputError(f"{path} is no state of a run, or damaged: {reason(error)}") from None
+        state = self.state(self.frames[-1] if frame is None else frame, colour)
+        return Offscreen(self.scene, size, camera, colour).image(state)
 
 
 def _write(path: Path, given: dict, arrays: dict[str, np.ndarray]) -> None:
@@ -174,11 +161,16 @@ def _write(path: Path, given: dict, arrays: dict[str, np.ndarray]) -> None:
         np.savez(file, header=np.frombuffer(header.encode(), dtype=np.uint8), **arrays)
 
 
-def _read(path: Path) -> tuple[dict, dict[str, np.ndarray]]:
-    """Return what `_write` wrote. Raises OutputError for another format."""
-    with np.load(path, allow_pickle=False) as file:
-        arrays = {name: file[name] for name in file.files}
-    header = json.loads(arrays.pop("header").tobytes())
-    if header["format"] != FORMAT:
-        raise OutputError(f"{path} has format {header['format']}, and this version reads format {FORMAT}")
-    return join_arrays(header["content"], arrays), arrays
+@contextmanager
+def _read(path: Path) -> Iterator[tuple[dict, Mapping[str, np.ndarray]]]:
+    """Yield what `_write` wrote; arrays are read when they are asked for. Raises OutputError, also for another format."""
+    try:
+        with np.load(path, allow_pickle=False) as arrays:
+            header = json.loads(arrays["header"].tobytes())
+            if header["format"] != FORMAT:
+                raise OutputError(f"{path} has format {header['format']}, and this version reads format {FORMAT}")
+            yield join_arrays(header["content"], arrays), arrays
+    except TaisoftError:
+        raise
+    except Exception as error:  # NumPy, zipfile and the content raise many types
+        raise OutputError(f"{path} is no state of a run, or damaged: {reason(error)}") from None

@@ -1,8 +1,11 @@
 """`taisoft draw`: the pictures of a finished run again, and other ones, without computing; what it refuses."""
 
+import numpy as np
 import pytest
 
 from taisoft.cli import main
+from taisoft.cli.recording import make_video
+from taisoft.errors import OutputError
 from tests.cli.command import BEAM, run, write
 from tests.output.png import decode
 
@@ -61,13 +64,13 @@ def test_another_look(finished, tmp_path):
         (
             ("--colour", "slip"),
             2,
-            "colour 'slip' cannot be drawn: the run has kept stress, speed; run it again with --keep stress,speed,slip",
+            "colour 'slip' cannot be drawn: frame 0 has kept stress, speed; run it again with --keep stress,speed,slip",
         ),
         (("--scale", "2"), 2, "--scale is that of a quantity, so it needs --colour"),
         (("--camera", "position = [[0, 0, 9], [0, 0, 8]]"), 2, "camera: key frames of position, target or fov need times [s]"),
         (("--look", "none.toml"), 2, "none.toml: the file cannot be read: No such file"),
         (("--camera", "position = [0, 0, 0]"), 2, "camera.position and target must differ"),
-        (("--camera", "place = [0, 0, 0]"), 2, "place"),
+        (("--camera", "place = [0, 0, 0]"), 2, "camera.place is not"),
         (("--camera", "position = 3 2"), 2, "--camera position = 3 2: write a .toml file, or keys as in"),
         (("--camera", "none.toml"), 2, "--camera none.toml: the file cannot be read: No such file"),
         (
@@ -79,6 +82,7 @@ def test_another_look(finished, tmp_path):
         (("--set", "beam.color=#ffffff"), 2, "--set beam.color=#ffffff: write NAME.colour="),
         (("--set", "bean.colour=#ffffff"), 2, "no body or obstacle is called 'bean' (did you mean beam?)"),
         (("--set", "beam.opacity=2"), 2, "opacity must be at least 0.02 and at most 1, not 2"),
+        (("--set", "beam.colour=null"), 2, "there is no value"),
         (("--slow", "2"), 2, "--slow is the speed of the film, so it needs --video"),
     ],
 )
@@ -89,9 +93,7 @@ def test_refusals(finished, tmp_path, capsys, arguments, status, text):
 
 def test_the_run_itself_stays(finished, tmp_path, capsys):
     before = pictures(finished)
-    assert (
-        draw(finished, "--out", finished, "--overwrite") == 2 and "it is the folder of the run itself" in capsys.readouterr().err
-    )
+    assert draw(finished, "--out", finished, "--overwrite") == 2 and "it is the folder of a run" in capsys.readouterr().err
     assert draw(tmp_path) == 2 and "there are no states of a run" in capsys.readouterr().err
     assert pictures(finished) == before
 
@@ -106,3 +108,19 @@ def test_a_run_that_keeps_nothing(beam, tmp_path, capsys):
     capsys.readouterr()
     for keep, text in (("stres", "--keep stres: 'stres' is not a valid name (did you mean stress?)"), ("error", "needs --error")):
         assert run(beam, "--out", tmp_path / "new", "--keep", keep) == 2 and text in capsys.readouterr().err
+
+
+def test_a_resumed_run_keeps_the_same_and_starts_its_automatic_camera_anew(beam, tmp_path, capsys):
+    """A film needs all its pictures."""
+    out, own = tmp_path / "out", ("--camera", "position = [-90, 1, -90]")
+    assert run(beam, "--out", out, "--seconds", "0.07", "--keep", "speed,stretch", "--no-usd", *own, *SIZE) == 0
+    resumed = ("--out", out, "--resume", out / "checkpoint.npz", "--no-usd", *SIZE)
+    for keep in ("speed", "none"):
+        assert run(beam, *resumed, "--keep", keep) == 3
+        assert f"--keep {keep}: the run that is resumed keeps speed,stretch" in capsys.readouterr().err
+    assert run(beam, *resumed) == 0 and draw(out, *SIZE, "--colour", "stretch", "--caption") == 0
+    last = decode(pictures(out)["00003.png"]).astype(int)
+    assert (np.ptp(last, axis=2) > 40).mean() > 0.1, "the body fills the picture again"
+    (out / "drawn/frames/00001.png").unlink()
+    with pytest.raises(OutputError, match="video.mp4 cannot be made: pictures are missing between 0 and 3"):
+        make_video(out / "drawn", 30.0)

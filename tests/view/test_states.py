@@ -49,9 +49,9 @@ def test_pictures_are_the_same_again(build, tmp_path):
     assert run.frames == [0, 1, 5] and len(run) == 3
     again = Offscreen(run.scene, SIZE, colour="stress", layers=LAYERS)
     for picture, frame in zip(first, run.frames):
-        state = run.state(frame)
+        state = run.state(frame, "stress")
         assert np.array_equal(again.image(state), picture) and state.time == 0.1 * frame
-        assert set(state.values) == {"speed", "stress"}
+        assert list(state.values) == ["stress"] and list(run.state(frame, "speed").values) == ["speed"]
     assert not np.array_equal(first[0], first[2])
 
 
@@ -83,13 +83,15 @@ def test_refusals(stored, tmp_path):
         (
             lambda: run.picture(0, SIZE, "slip"),
             OutputError,
-            "colour 'slip' cannot be drawn: the run has kept speed, stress; .* --keep speed,stress,slip$",
+            "colour 'slip' cannot be drawn: frame 0 has kept speed, stress; .* --keep speed,stress,slip$",
         ),
         (lambda: run.picture(0, SIZE, "slop"), OutputError, "colour 'slop' is unknown"),
         (lambda: run.state(2), OutputError, "there is no frame 2: they are 0 to 5$"),
         (lambda: run.paint("tow", "#ffffff"), SceneError, "no body or obstacle is called 'tow' .did you mean two"),
         (lambda: run.paint("two", "red"), SceneError, "^'two': colour must be '#rrggbb'"),
         (lambda: run.paint("lid", opacity=0), SceneError, "^'lid': opacity must be at least 0.02"),
+        (lambda: run.picture(0, SIZE, camera=(1, 2, 3)), SceneError, "^camera must be a Camera, not tuple"),
+        (lambda: run.picture(0, SIZE, camera=ts.Camera((1, 0, 0), follow="tow")), SceneError, "no body is called 'tow'"),
         (lambda: setattr(run, "background", "red"), SceneError, "^scene: background must be '#rrggbb'"),
         (
             lambda: setattr(run, "camera", ts.Camera((1, 0, 0), follow="tow")),
@@ -113,12 +115,12 @@ def test_refusals(stored, tmp_path):
 
 
 def test_without_states_nothing_is_written(tmp_path):
-    assert len(written(tmp_path, moving_scene, None)) == 3 and list(tmp_path.iterdir()) == []
+    assert len(written(tmp_path, moving_scene, ())) == 3 and list(tmp_path.iterdir()) == []
 
 
 def test_a_write_error_is_raised_later(tmp_path):
     sim = Shown(moving_scene())
-    writer = StateWriter(tmp_path, Sampler(sim.scene), (), [], ((), "body"))
+    writer = StateWriter(tmp_path, Sampler(sim.scene), ("speed",), [], ((), "body"))
     shutil.rmtree(tmp_path / "states")
     writer.frame(sim, 0)
     for use in (writer.flush, lambda: writer.frame(sim, 1), writer.close):
