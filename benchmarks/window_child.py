@@ -19,6 +19,7 @@ from taisoft.cli.scene_file import load_scene
 from taisoft.output.viewpoint import Viewpoint
 from taisoft.view.live import LiveRun
 from taisoft.view.picking import pick
+from taisoft.view.sampling import Sampler
 from taisoft.view.screen import MESSAGES, PANEL, SIZE, free_part
 from taisoft.view.window import WindowProcess
 
@@ -57,9 +58,10 @@ def press(key: str, run: LiveRun) -> None:
 def grip(sim: ts.Simulator) -> tuple[int, int]:
     """Return a pixel in the middle of what is visible of a body in the view after framing, beside the panels."""
     camera = Viewpoint.framing(sim.positions(), SIZE, free_part(PANEL, SIZE))
+    state = Sampler(sim.scene).state(sim, energies=False)
     hits: dict[int, list[tuple[float, float]]] = {}  # cursors by body
     for x, y in itertools.product(SIDES, SIDES):
-        if x > PANEL[0] + PANEL[2] and y > 1.0 - MESSAGES[1] and (hit := pick(sim, camera, (x, y), SIZE)) is not None:
+        if x > PANEL[0] + PANEL[2] and y > 1.0 - MESSAGES[1] and (hit := pick(state, camera, (x, y), SIZE)) is not None:
             hits.setdefault(hit.body, []).append((x, y))
     if not hits:
         raise ts.SimulationError("no body is visible beside the panels")
