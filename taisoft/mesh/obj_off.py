@@ -37,29 +37,26 @@ def read_obj(name: str, data: bytes) -> tuple[np.ndarray, list[np.ndarray], list
             elif words[0] in current:
                 current[words[0]] = " ".join(words[1:])
             elif words[0] == "f":
-                corners, *of_texture = zip(*(_corner(word) for word in words[1:]), strict=True)
-                if len(corners) < 3 or 0 in corners or max(map(abs, corners)) > len(data):
+                parts = [word.split("/", 2) for word in words[1:]]
+                corners = [to_int(part[0]) for part in parts]
+                given = [to_int(part[1]) for part in parts if len(part) > 1 and part[1]]
+                if len(corners) < 3 or len(given) not in (0, len(corners)) or 0 in corners or max(map(abs, corners)) > len(data):
                     raise ValueError
-                for k in of_texture[0] if of_texture else ():
+                for k in given:
                     if not -len(texture) <= k <= n or k == 0:
                         raise MeshError(f"{name}: line {number}: vt {k} does not exist ({n} are given)")
                 for kind, called in current.items():
                     if called:
                         members[kind].setdefault(called, []).append(len(polygons))
                 polygons.append(np.array([[k - 1 if k > 0 else len(points) + k for k in corners]]))
-                given = of_texture[0] if of_texture else (n + 1,) * len(corners)
-                rows.append([k - 1 if k > 0 else len(texture) + k for k in given] if n else ())
+                rows += [k - 1 if k > 0 else len(texture) + k for k in given or [n + 1] * len(corners)]
         except ValueError:
             raise MeshError(f"{name}: line {number}: expected {RULES[words[0]]}, not {one_line(' '.join(words))!r}") from None
-    table = np.array([*texture, (np.nan, np.nan)])
-    uvs = [table[[one]] for one in rows] if any(one and min(one) < n for one in rows) else None
+    uvs = None
+    if rows and min(rows) < n:
+        ends = np.cumsum([one.shape[1] for one in polygons])
+        uvs = np.split(np.array([*texture, (np.nan, np.nan)])[None, rows], ends[:-1], axis=1)
     return np.array(points, dtype=np.float64).reshape(-1, 3), polygons, uvs, next((of for of in members.values() if of), {})
-
-
-def _corner(word: str) -> tuple[int, ...]:
-    """Return the numbers of a corner's v and, if it is given, its vt."""
-    position, *texture = word.split("/")[:2]
-    return (to_int(position), *(to_int(k) for k in texture if k))
 
 
 def read_off(name: str, data: bytes) -> tuple[np.ndarray, list[np.ndarray]]:
