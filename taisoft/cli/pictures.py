@@ -10,6 +10,7 @@ from taisoft.scene import checks
 from taisoft.scene.checks import nearest
 from taisoft.scene.look import Camera
 from taisoft.scene.tables import Table
+from taisoft.scene.toml import parsed
 from taisoft.view.annotations import text_missing
 from taisoft.view.offscreen import SIZE, checked_size
 from taisoft.view.pictures import PictureOptions
@@ -40,15 +41,17 @@ def slowness(arguments: Namespace) -> float:
 
 def camera_of(text: str) -> Camera:
     """Return the camera of --camera: a .toml file with a table [camera], or the keys of that table. Raises SceneError."""
-    is_file = text.strip().endswith(".toml")
-    file = Path(text.strip() if is_file else "--camera")
-    try:
-        tables = tomllib.loads(file.read_text(encoding="utf-8") if is_file else f"camera = {{ {text} }}")
-    except OSError as error:
-        raise SceneError(f"--camera {text}: the file cannot be read: {error.strerror}") from None
-    except ValueError:
-        example = "'position = [3, 2, 4], target = [0, 0.5, 0], fov = 30'"
-        raise SceneError(f"--camera {text}: write a .toml file, or keys as in {example}") from None
+    if text.strip().endswith(".toml"):
+        file = Path(text.strip())
+        with reworded(SceneError, "--camera "):
+            tables = parsed(file)
+    else:
+        file = Path("--camera")
+        try:
+            tables = tomllib.loads(f"camera = {{ {text} }}")
+        except ValueError:
+            example = "'position = [3, 2, 4], target = [0, 0.5, 0], fov = 30'"
+            raise SceneError(f"--camera {text}: write a .toml file, or keys as in {example}") from None
     if "camera" not in tables:
         raise SceneError(f"--camera {text}: the file has no table [camera]")
     return Table(file, "", tables, list(tables)).made("camera", Camera, "camera: ")

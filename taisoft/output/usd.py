@@ -46,9 +46,8 @@ class UsdWriter:
     folder: the run's folder; scene: its meshes and names are read at construction; fps: frames per second of simulated time
     [1/s]; chunk_frames: frames per chunk, the most that are lost if the process is killed; self_collision: the simulator's
     setting, which decides with the scene whether there can be contacts; first: number of the first frame of a resumed run;
-    earlier frames are copied from the folder; errors: whether the run estimates errors; values: of its nodes, which
-    writers may share. Raises OutputError, also if an obstacle's
-    path fails or the folder holds another scene or frame rate.
+    earlier frames are copied from the folder; errors: whether the run estimates errors; values: of its nodes, which writers may
+    share. Raises OutputError, also if an obstacle's path fails or the folder holds another scene or frame rate.
     """
 
     def __init__(

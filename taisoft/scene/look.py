@@ -49,7 +49,7 @@ def lights_of(value) -> "tuple[Light, ...] | None":
     """Return lights as a tuple; None for None. Raises SceneError."""
     if value is None:
         return None
-    lights = (value,) if isinstance(value, Light) else tuple(value) if isinstance(value, (list, tuple)) else (value,)
+    lights = tuple(value) if isinstance(value, (list, tuple)) else (value,)
     for k, one in enumerate(lights):
         if not isinstance(one, Light):
             raise SceneError(f"scene: light {k} must be a Light, not {value_text(one)}")

@@ -54,8 +54,8 @@ class DrawnBody:
         skin, surface = body.riding_skin, np.asarray(body.nodes.surface)
         fixed = [c.nodes for c in scene.constraints(body) if c.path is None] if skin is None else []
         fixed = np.intersect1d(np.concatenate(fixed), surface) if fixed else np.empty(0, dtype=np.int64)
-        loaded = [body.mesh.surface[_some(t.triangles, MAX_LOAD_ARROWS)] for t in body.tractions]
-        look = body.colour, body.opacity, _some(fixed, MAX_MARKERS), loaded
+        loaded = [body.mesh.surface[some(t.triangles, MAX_LOAD_ARROWS)] for t in body.tractions]
+        look = body.colour, body.opacity, some(fixed, MAX_MARKERS), loaded
         drawn = cls(body.name, np.asarray(body.position), np.asarray(body.rest_positions), surface, *look)
         if skin is not None:
             drawn.vertices, drawn.triangles, drawn.weights = skin.surface.vertices, skin.surface.triangles, skin.weights
@@ -118,7 +118,7 @@ class DrawnScene:
         if isinstance(scene, cls):
             return scene
         starts = scene.first_nodes
-        attached = [starts[one.a] + _some(one.nodes, MAX_CROSSES) for one in scene.attachments]
+        attached = [starts[one.a] + some(one.nodes, MAX_CROSSES) for one in scene.attachments]
         look = scene.background, scene.lights, scene.camera, framed_points(scene)
         marks = np.concatenate([np.zeros(0, dtype=np.int64), *attached]), []
         drawn = cls(scene.up, [DrawnBody.of(scene, body) for body in scene.bodies], list(scene.obstacles), *look, *marks)
@@ -126,7 +126,7 @@ class DrawnScene:
             corners = body.mesh.surface[load.triangles]
             extent = np.sort(np.ptp(body.mesh.vertices[np.unique(corners)], axis=0))[1]
             longest = min(PRESSURE_ARROW * drawn.size, IN_CHANNEL * float(extent))
-            drawn.pressed.append((_some(corners, MAX_ARROWS) + starts[body.name], longest))
+            drawn.pressed.append((some(corners, MAX_ARROWS) + starts[body.name], longest))
         return drawn
 
     def plain(self) -> dict:
@@ -211,7 +211,7 @@ def _fields(record) -> dict:
     return {one.name: getattr(record, one.name) for one in fields(record)}
 
 
-def _some(items: np.ndarray, most: int) -> np.ndarray:
+def some(items: np.ndarray, most: int) -> np.ndarray:
     """Return items, of more than `most` evenly selected ones."""
     return items[:: -(-len(items) // most) or 1]
 
@@ -230,7 +230,7 @@ def _obstacle(shape: str, fields: dict, pose: list | None, **given) -> Obstacle:
 def _strokes(body) -> tuple[np.ndarray, np.ndarray]:
     """Nodes (k,4) of tets, and their weights (k,2,4) in the ends of strokes along a body's fibres in triangles of its surface."""
     mesh = body.mesh
-    chosen = _some(np.flatnonzero(body.fibres[mesh.surface_tets].any(axis=1)), MAX_STROKES)
+    chosen = some(np.flatnonzero(body.fibres[mesh.surface_tets].any(axis=1)), MAX_STROKES)
     a, b, c = np.moveaxis(mesh.vertices[mesh.surface[chosen]], 1, 0)
     normal, tets = np.cross(b - a, c - a), mesh.tets[mesh.surface_tets[chosen]]
     area = np.linalg.norm(normal, axis=1, keepdims=True)

@@ -8,7 +8,7 @@ from taisoft.errors import OutputError, SceneError, SimulationError, reworded
 from taisoft.output.connection_lines import ConnectionLines
 from taisoft.output.nodal_fields import NodalValues
 from taisoft.scene.loads import Cavity, value_at
-from taisoft.view.drawn import ENERGIES, DrawnScene, DrawnState, pressing
+from taisoft.view.drawn import ENERGIES, DrawnScene, DrawnState, pressing, some
 
 MAX_SEGMENTS = 400  # of springs and tendons, in all
 MAX_CONTACTS = 1000  # that are drawn
@@ -23,9 +23,7 @@ class Sampler:
         if scene.has_springs:
             exact = scene.exact_attachments
             self._lines = ConnectionLines(scene, [one for one in scene.connections if one not in exact])
-            ends, line = self._lines.segments
-            step = -(-len(ends) // MAX_SEGMENTS)
-            self._ends, self._line = ends[::step], line[::step]
+            self._ends, self._line = (some(items, MAX_SEGMENTS) for items in self._lines.segments)
 
     def state(self, sim, layers: Iterable[str] = (), kinds: Iterable[str] = (), energies: bool = True) -> DrawnState:
         """Return sim's present state, with what visible layers and colours show; energies: for a caption, or the window.

@@ -61,7 +61,7 @@ class SceneView:
         self._widest = 0.0  # largest automatic distance [m]; 0: the camera does not move back
         if self.camera is None:
             self.look_from(size)
-        self.surfaces, self._lights = Surfaces(self.scene), self.scene.lights
+        self.surfaces = Surfaces(self.scene)
         self.layers = Layers(self.scene, layers)
         self.colouring = Colouring(self.surfaces, colour)
 
@@ -90,7 +90,7 @@ class SceneView:
             self.camera = camera_viewpoint(self.scene, state.time, state.x)
         self.camera = self.camera.widened(bodies[0], size, self._widest, self._free(size))
         x, normals = self.surfaces.with_obstacles(bodies, state, self.camera.position)
-        colours = lit_colours(x, normals, self.colouring.base(state), self.camera, self._lights, self.scene.up)
+        colours = lit_colours(x, normals, self.colouring.base(state), self.camera, self.scene.lights, self.scene.up)
         return x, colours, self.layers.lines(state, self.camera)
 
 

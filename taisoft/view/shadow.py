@@ -39,11 +39,11 @@ class ShadowMap:
 
 
 class Shadows:
-    """Shadow maps of the half-spaces of `Surfaces`. scene: a `DrawnScene`."""
+    """Shadow maps of the half-spaces of `Surfaces`. scene: a `DrawnScene`; towards: unit vector (3,) to the light."""
 
     def __init__(self, scene, surfaces):
         steep = [-one.direction for one in scene.lights or () if -one.direction @ UP[scene.up] >= MIN_SLOPE]
-        self._surfaces, self._up = surfaces, steep[0] if steep else UP[scene.up]  # towards the light
+        self._surfaces, self.towards = surfaces, steep[0] if steep else UP[scene.up]
         self._size = scene.size
         self._raster: Raster | None = None  # made for the first half-space
 
@@ -65,7 +65,7 @@ class Shadows:
         found = []
         for vertices, boundary in self._surfaces.half_spaces(x, poses):
             axes = _frame(boundary)
-            if axes is None or axes[2] @ self._up < MIN_SLOPE:
+            if axes is None or axes[2] @ self.towards < MIN_SLOPE:
                 continue
             drawn = self._map(x[: self._surfaces.n_of_bodies], boundary[0], axes, boundary)
             if drawn is not None:
@@ -74,8 +74,8 @@ class Shadows:
 
     def _map(self, x: np.ndarray, origin, axes, boundary) -> tuple[np.ndarray, ...] | None:
         """Return the last four fields of a `ShadowMap`; None without a shadow."""
-        height = (x - origin) @ axes[2] / (axes[2] @ self._up)
-        shadow = (x - origin) @ axes[:2].T - height[:, None] * (axes[:2] @ self._up)
+        height = (x - origin) @ axes[2] / (axes[2] @ self.towards)
+        shadow = (x - origin) @ axes[:2].T - height[:, None] * (axes[:2] @ self.towards)
         drawn = shadow[np.isfinite(shadow).all(axis=1)]
         if len(drawn) == 0:
             return None

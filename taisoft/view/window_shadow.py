@@ -6,7 +6,6 @@ The renderer of the window interpolates colours between vertices only, so that t
 import numpy as np
 from scipy.spatial import ConvexHull
 
-from taisoft.mesh.placing import UP
 from taisoft.output.viewpoint import Viewpoint
 from taisoft.scene.obstacles import HalfSpace
 from taisoft.view.colouring import lit_colours
@@ -21,9 +20,9 @@ class ShadowMesh:
     """Meshes of the shadows on the half-spaces of a scene. size: their largest numbers of vertices and triangles."""
 
     def __init__(self, scene, surfaces):
-        self._shadows, self._surfaces, self._lights = Shadows(scene, surfaces), surfaces, scene.lights
+        self._scene, self._surfaces, self._shadows = scene, surfaces, Shadows(scene, surfaces)
         grounds = [o for o in scene.obstacles if isinstance(o.shape, HalfSpace)]
-        n_maps = sum(o.path is not None or o.shape.normal @ UP[scene.up] >= MIN_SLOPE for o in grounds)
+        n_maps = sum(o.path is not None or o.shape.normal @ self._shadows.towards >= MIN_SLOPE for o in grounds)
         side = TEXELS // EVERY
         centres = EVERY * np.arange(side) + 0.5 * EVERY
         v, u = np.meshgrid(centres, centres, indexing="ij")
@@ -46,7 +45,8 @@ class ShadowMesh:
             darkness = one.darkness.reshape(side, EVERY, side, EVERY).mean(axis=(1, 3)).reshape(-1, 1)
             triangles.append(self._triangles[darkness[self._triangles, 0].max(axis=1) > FAINT] + len(points) * len(own))
             normals, base = (np.tile(row, (len(own), 1)) for row in (one.axes[2], self._surfaces.colours[one.vertices.start]))
-            colours.append(lit_colours(own, normals, base, camera, self._lights) * (1.0 - darkness))
+            lit = lit_colours(own, normals, base, camera, self._scene.lights, self._scene.up)
+            colours.append(lit * (1.0 - darkness))
             points.append(camera.nearer(own, LIFT))
         if not points:
             return None

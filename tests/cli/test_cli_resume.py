@@ -70,8 +70,8 @@ def test_two_parts_equal_one_run(single, tmp_path, capsys):
     assert record["resumed"] == {"checkpoint": str(out / "checkpoint.npz"), "time": pytest.approx(0.1), "frame": 3}
     assert record["sim_seconds"] == pytest.approx(0.1) and record["steps"] == 24
     assert report(single)["resumed"] is None
-    told = capsys.readouterr()
-    assert f"resumed  from {out / 'checkpoint.npz'}, t = 0.1 s" in told.out and "taisoft draw" not in told.err
+    shown = capsys.readouterr()
+    assert f"resumed  from {out / 'checkpoint.npz'}, t = 0.1 s" in shown.out and "taisoft draw" not in shown.err
     other = ("--seconds", "0.24", "--size", "32x18", "--no-usd")
     assert run(path, "--out", out, "--resume", out / "checkpoint.npz", *other) == 0
     rule = f"pictures differ in size or look from those before frame 6: `taisoft draw {out}` draws all of them alike"

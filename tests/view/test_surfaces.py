@@ -179,6 +179,18 @@ def test_the_window_has_the_shadow_as_a_mesh_on_the_ground():
     assert ShadowMesh(clear, Surfaces(clear)).draw(x, {}, ABOVE) is None, "it would hide what a transparent ground shows"
 
 
+def test_the_mesh_of_shadows_has_room_for_a_wall_that_faces_a_slanting_light():
+    scene = cube_above(0.1)
+    scene.add_obstacle(ts.HalfSpace((-1, 0, 0), (1, 0, 0)), "wall")
+    scene.lights = (ts.Light((-1, -1, 0)),)
+    surfaces = Surfaces(scene)
+    state = sampled(FakeSimulator(scene))
+    x, _ = surfaces.with_obstacles(surfaces.of_bodies(state), state, ABOVE.position)
+    mesh = ShadowMesh(state.scene, surfaces)
+    points, _, triangles = mesh.draw(x, state.poses, ABOVE)
+    assert len(points) == mesh.size[0] and points[:, 0].min() < -0.5 and len(triangles) <= mesh.size[1]
+
+
 def test_a_blur_keeps_the_sum_and_spreads_by_its_deviation():
     smooth = blurred(np.pad(np.ones((1, 1)), ((20, 19), (30, 29))), (2.0, 4.0))
     assert smooth.sum() == pytest.approx(1.0)
