@@ -21,7 +21,7 @@ class MatrixContacts:
 
     def solve(
         self,
-        W: sp.csr_matrix,
+        W: sp.spmatrix,
         b: np.ndarray,
         friction: np.ndarray,
         r: np.ndarray,
@@ -35,7 +35,7 @@ class MatrixContacts:
         W: (3k,3k); b: (3k,); friction: (k,); method, tolerance, sweeps: as in `contact.solve.solve`; outer: maximum iterations of
         the augmented Lagrangian.
         """
-        W, k = W.tobsr((3, 3)), len(friction)
+        W, k = sp.bsr_matrix(W, blocksize=(3, 3)), len(friction)
         p = self._problem
         if p is None or p.capacity < k or p.column.shape[0] < len(W.indices):
             arena = FieldArena()

@@ -79,13 +79,14 @@ class Friction:
     LAW_DECREASE = 0.8  # times the previous laws' residual: below it R stays
 
     @classmethod
-    def solve(cls, system: StageSystem, goal: Goal, r: float, stalled: bool = False) -> Solution:
+    def solve(cls, system: StageSystem, goal: Goal, r: float, directly: bool = False) -> Solution:
         """Solve from |r| by linear solves, each followed by the step to zero slope, and updates of the multipliers.
 
-        Directly where that applies, and if these fail. stalled: iterations have failed on the stage's last problem.
+        Directly where that applies, and once these have taken longer. directly: at once.
         """
-        if (found := cls._solve_directly(system, goal, r, stalled)) is not None:
+        if (found := cls._solve_directly(system, goal, r, directly)) is not None:
             return found
+        patience = system.patience
         if goal.r_scale != system.r_scale:
             r = system.update_multipliers(goal.r_scale, to_impulses=False)
         scale, law_before, n_steps, n_stored, rounding = goal.r_scale, math.inf, 0, 0, False
@@ -106,7 +107,7 @@ class Friction:
                     scale = cls.next_scale(scale, law, law_before, n_steps, system.frictionless, goal.max_r_scale, goal.law)
                 r = system.update_multipliers(scale, to_impulses=not extrapolating)
                 law_before, n_steps, rounding, inner, updates = law, 0, False, cls.PROGRESS * r, updates + 1
-            elif solves >= goal.max_solves:
+            elif solves >= goal.max_solves or system.duration_of(linear, solves + updates) > patience:
                 break
             else:
                 found = system.solve_linear(max(goal.forcing, goal.later if solves else 0.0))
@@ -116,16 +117,19 @@ class Friction:
                 before, r = r, system.advance(scale)
                 rounding = r <= cls.ROUNDING * system.floor and r > 0.5 * before
         system.r_scale = FIRST_R
-        if not (converged or negative or stalled):
-            if (found := cls._solve_directly(system, goal, r, stalled=True)) is not None:
+        if not (converged or negative):
+            if (found := cls._solve_directly(system, goal, r, first=True)) is not None:
                 return found._replace(solves=solves + 1, linear=linear, updates=updates)
+            if patience < math.inf and solves < goal.max_solves:
+                found = cls.solve(system, goal._replace(max_solves=goal.max_solves - solves), r)
+                return found._replace(solves=solves + found.solves, linear=linear + found.linear, updates=updates + found.updates)
         return Solution(solves, linear, updates, negative, converged, r, scale)
 
     @staticmethod
-    def _solve_directly(system: StageSystem, goal: Goal, r: float, stalled: bool) -> Solution | None:
+    def _solve_directly(system: StageSystem, goal: Goal, r: float, first: bool) -> Solution | None:
         """Return the result of a direct solve, None if that does not apply."""
         try:
-            found = system.solve_directly(goal.law, stalled)
+            found = system.solve_directly(goal.law, first)
         except np.linalg.LinAlgError:
             return Solution(1, 0, 0, True, False, r)
         if found is None:

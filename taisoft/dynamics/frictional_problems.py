@@ -16,12 +16,12 @@ class FrictionalProblems:
     LAW_BALANCE = 0.03  # laws' residual over the required relative |r|; the next matrix would undo more accuracy
     MULTIPLIER_FRACTION = 0.3  # of the required |r|, ends the steps under one multiplier: updates at a large |r| overshoot
     NEAR_FLOOR = 4.0  # times the floor of |r|: below it, |r| may be mostly rigid motion
+    TRIAL = 64  # problems in a row that are solved directly before iterations are tried again
     R_STALLED, MAX_R_STALLED = 1000.0, 1e5  # smallest first R and upper bound without friction, where the laws stalled before
 
     def __init__(self, system: StageSystem, stage: Stage):
         self._system, self._stage = system, stage
         self.tight = False  # whether the last problem was near the floor
-        self.is_direct = False  # whether it was solved directly, as the next one then is first
         # laws that hold better than they must let |r| converge in fewer iterations, where they can
         self._law_aim = min(stage.contact_tolerance, stage.tolerance)
         self._r_scale, self._max_r_scale = FIRST_R, MAX_R_FRICTIONLESS
@@ -48,9 +48,18 @@ class FrictionalProblems:
             max_r_scale=self._max_r_scale,
         )
 
+    @property
+    def is_direct(self) -> bool:
+        """Whether the next problem is to be solved directly at once: as the last one was, but for a trial now and then."""
+        return self._system.n_direct % self.TRIAL > 0
+
+    def count(self, found: Solution) -> None:
+        """Count the problems that were solved directly."""
+        self._system.n_direct = self._system.n_direct + 1 if found.direct else 0
+
     def learn(self, goal: Goal, found: Solution) -> None:
         """Take account of a problem's solution."""
-        self.is_direct = found.direct
+        self.count(found)
         if not (found.converged or found.negative):
             self._law_aim = self._stage.contact_tolerance
         if self._system.frictionless and not (found.negative or found.direct):

@@ -72,7 +72,7 @@ class Newton:
         while True:
             if self.has_rows and self.newton and stage.renews and system.renew_contacts():
                 self._evaluate_again()
-                fresh = True
+                fresh = False
             if self._has_converged():
                 if is_accepted := self._passes_checks():
                     break
@@ -250,7 +250,7 @@ class Newton:
         system, accept, self.previous = self.system, self.DECREASE * self.lowest, self.r
         system.linearise()
         goal = self.problems.goal(self.r, self.scale, self._is_balanced)
-        found = self._add_friction(Friction.solve(system, goal, self.r, self.problems.is_direct and not self.problems.tight))
+        found = self._add_friction(Friction.solve(system, goal, self.r, self.problems.is_direct))
         self.is_projected = found.negative
         if found.negative:  # the problem has no minimum
             system.end_linearised(accept=False)
@@ -316,7 +316,8 @@ class Newton:
             forcing = stage.linear_tolerance or self.LINEARISED_FORCING
             solves = min(self.LINEARISED_SOLVES, system.budget.left)
             goal = Goal(norm, stage.contact_tolerance, norm, forcing, max_solves=solves)
-            found = self._add_friction(Friction.solve(system, goal, self.r))
+            found = self._add_friction(Friction.solve(system, goal, self.r, self.problems.is_direct))
+            self.problems.count(found)
             self._count(found.solves)
             if not found.negative or projected:
                 break

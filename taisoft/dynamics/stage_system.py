@@ -8,7 +8,6 @@ with contacts those of the augmented Lagrangian, see `contact_terms`. c = 1 for 
 displacement). K is unprojected.
 """
 
-import contextlib
 import math
 from typing import Any
 
@@ -32,6 +31,7 @@ from taisoft.dynamics.contact_terms import (
     update_impulses,
 )
 from taisoft.dynamics.direct import DirectSolver
+from taisoft.dynamics.frame_factors import set_frame_factors
 from taisoft.dynamics.linear_solver import LinearSolver
 from taisoft.dynamics.linearised import advance, begin_linearised, end_linearised, find_step_length, update_multipliers
 from taisoft.dynamics.multipliers import Multipliers
@@ -84,6 +84,9 @@ class StageSystem:
     BALANCED = 4.0  # |r|_p over s_p of a piece, times the tolerance and the root of their number: a converged piece has less
     NEARLY = 0.1  # of the tolerance: |r|_p over s_p below which a component counts less in linear solves
     FOLLOWING = 1e-2  # tolerance of the linear solve for the first iterate of a static stage with prescribed nodes
+    # [s] of a block times a vector in an iteration with contacts, and of what a linear solve or an update of multipliers takes
+    # beside its iterations, measured on one core
+    ITERATION, CALLS = 3e-9, 5e-5
     VOLUME_PASSES = 2  # corrections of the first iterate, each of which leaves errors of second order
 
     def __init__(
@@ -125,6 +128,7 @@ class StageSystem:
         self.scale = 0.0  # that |r| is relative to, at its last evaluation
         self.r_scale = 1.0  # R over the r-factors
         self.frictionless = False  # whether no contact of the stage has friction
+        self.n_direct = 0  # frictional problems in a row that were solved directly
         self._contact_arena = FieldArena()
         self._storage: StageContacts | None = None  # storage for the contacts of this step
         self.contacts = NO_CONTACTS  # of the present stage
@@ -149,7 +153,7 @@ class StageSystem:
 
     def snapshot(self) -> dict:
         """Return what persists between stages: rounding floor, reactions, and the choice of the linear solver."""
-        own = {"residual": self.work.residual.to_numpy(), "linear_solver": self.linear_solver.snapshot()}
+        own = {"residual": self.work.residual.to_numpy(), "linear_solver": self.linear_solver.snapshot(), "direct": self.n_direct}
         return self.rounding.snapshot() | own
 
     def restore(self, kept: dict) -> None:
@@ -157,6 +161,7 @@ class StageSystem:
         self.rounding.restore(kept)
         upload([(self.work.residual, kept["residual"])])
         self.linear_solver.restore(kept["linear_solver"])
+        self.n_direct = int(kept["direct"])
 
     def numbers_changed(self) -> None:
         """Update for changed gravity or material numbers."""
@@ -290,7 +295,7 @@ class StageSystem:
         """Take the contacts' geometry at the present iterate, see `contact_geometry`; return whether it changed.
 
         A linearised step has one iterate: its geometry is that where the nodes would be at its end without forces. If it changed,
-        the matrix is formed, and (|r|, scale) must be evaluated again.
+        (|r|, scale) must be evaluated again.
         """
         if self.stage.linearised:
             predict(self.model, self.work, self.contacts, self.stage.beta)
@@ -301,9 +306,15 @@ class StageSystem:
         if not changed and self.step_contacts.problem is before.problem:
             return False
         self.begin_contacts()
-        if self.contacts is not before:  # the storage has grown: set the displacements there
+        if self.contacts is not before:  # the storage has grown: set the displacements there, and the diagonal
             move(self.model, self.work, self.contacts, self.kind, STAY, 1.0, self.stage.c, self.stage.beta)
-        self.form_matrix_and_factors()
+            self.form_matrix()
+        else:
+            self._same_matrix = False  # its rows are, but not those of the contacts' terms
+            self.linear_solver.matrix_changed()
+            if self._direct is not None:
+                self._direct.contacts_changed()
+        self.find_factors()
         return True
 
     def evaluate(self, mode: int | None = STAY, step_length: float = 1.0, new_multipliers: int = KEEP) -> tuple[float, float]:
@@ -422,16 +433,28 @@ class StageSystem:
         update_multipliers(self.model, self.work, self.contacts, int(to_impulses), self.stage.beta, r_scale)
         return math.sqrt(self.model.state.scalars[NORMS])
 
-    def solve_directly(self, tolerance: float, stalled: bool) -> tuple[int, bool, float] | None:
+    @property
+    def patience(self) -> float:
+        """Duration [s] of iterations on a frictional problem after which a direct solve is expected to have been faster."""
+        direct = self._direct
+        return math.inf if direct is None or self._rejects_direct else direct.seconds(self.n_contacts)
+
+    def duration_of(self, iterations: float, n: int) -> float:
+        """Expected duration [s] of n linear solves and updates of multipliers, with that number of iterations in all."""
+        return iterations * self.ITERATION * (2 * self.matrix.n_edges + self.model.n_nodes) + n * self.CALLS
+
+    def solve_directly(self, tolerance: float, first: bool) -> tuple[int, bool, float] | None:
         """Move a linearised stage to the solution of its frictional problem, see `direct`; None if that does not apply.
 
-        tolerance: of the laws' residual; stalled: whether iterations failed. Returns (iterations, converged, |r|); raises
-        numpy.linalg.LinAlgError as `DirectSolver.prepare`.
+        tolerance: of the laws' residual; first: whether iterations are not to be tried first. Returns (iterations, converged,
+        |r|); raises numpy.linalg.LinAlgError as `DirectSolver.prepare`.
         """
         direct = self._direct
-        if direct is None or self._rejects_direct or not (stalled or direct.is_rigid) or not direct.prepare(self.contacts):
+        if direct is None or self._rejects_direct or not (first or direct.is_rigid):
             return None
-        found = direct.solve(self.contacts, self.stage.beta, tolerance, max(tolerance, self.contact_residual))
+        found = None
+        if direct.prepare(self.contacts):
+            found = direct.solve(self.contacts, self.stage.beta, tolerance, max(tolerance, self.contact_residual))
         self._rejects_direct = found is None
         return found
 
@@ -502,12 +525,15 @@ class StageSystem:
             self.multipliers.upload(self.multipliers.effective)
 
     def form_matrix_and_factors(self, projected: bool = False) -> None:
-        """Form the matrix and the contacts' r-factors, which stay fixed during the stage."""
+        """Form the matrix and the contacts' r-factors, which stay fixed until their geometry is renewed."""
         self.form_matrix(projected)
+        self.find_factors()
+
+    def find_factors(self) -> None:
+        """Set the contacts' r-factors by the matrix formed last."""
         find_factors(self.contacts.problem)
-        if self._direct is not None and self._direct.is_rigid:
-            with contextlib.suppress(np.linalg.LinAlgError):  # the solve will project the matrix
-                self._direct.set_factors(self.contacts)
+        if self.model.has_rigid_tets and self.model.on_cpu:
+            set_frame_factors(self.model, self.matrix, self.contacts.coupling.base, self.contacts.problem)
 
     def solve_linear(self, tolerance: float) -> LinearResult:
         """Solve for y of pcg from its right side.
