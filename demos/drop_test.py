@@ -3,17 +3,18 @@
 A bar of 0.15 m and 0.05 x 0.05 m on 60 x 2 x 2 cells (1,200 tets), corotational, E = 0.1 MPa, nu = 0, 1000 kg/m^3, falls 0.1 m
 on a smooth plate. With nu = 0 this law makes stress proportional to stretch, so Saint-Venant's solution for the impact of a bar
 is exact: a wave runs up and back at c = sqrt(E / density), and until it is back, at T = 2 length / c, the plate pushes with
-area * density * c * (v + g t), v the speed of the impact. A step takes the wave through one layer of cells.
+area * density * c * (v + g t), v the speed of the impact. Steps are explicit, and nothing is damped: behind the front the mesh
+rings, by 5 % of the force, so the force is compared in the mean.
 
 `check` asserts the impulse law (the integral of contact force minus weight is the change of momentum), the force while the
-wave runs, its peak, and the duration.
+wave runs, its peak, the duration, and the speed at which the bar leaves.
 """
 
 import numpy as np
 
 import taisoft as ts
 
-solver = {"integrator": "implicit_euler", "dt": 1 / 4000, "seconds": 0.24, "fps": 200.0}
+solver = {"integrator": "velocity_verlet", "dt": 1 / 6000, "seconds": 0.24, "fps": 200.0}
 
 LENGTH, WIDTH, HEIGHT = 0.15, 0.05, 0.1  # [m]; HEIGHT: of the fall
 YOUNG, DENSITY, G = 1e5, 1000.0, 9.81  # [Pa], [kg/m^3], [m/s^2]
@@ -62,16 +63,20 @@ def check(sim: ts.Simulator, result) -> None:
     first, last, speed = impact(t, force, momentum)
     impulse = sim.dt * (force - weight)[first + 1 : last + 1].sum()
     change = momentum[last] - momentum[first]
-    # 2e-5 measured
-    assert abs(impulse / change - 1.0) < 1e-4, f"the momentum changes by {change:.6f} N s, the impulse is {impulse:.6f} N s"
+    # 4e-8 measured
+    assert abs(impulse / change - 1.0) < 1e-5, f"the momentum changes by {change:.6f} N s, the impulse is {impulse:.6f} N s"
     assert abs(speed / np.sqrt(2 * G * HEIGHT) - 1.0) < 5e-3, f"the bar arrives at {speed:.4f} m/s"
 
     after = t - t[first]
     wave = (after > 0.2 * CONTACT) & (after < 0.6 * CONTACT)
     exact = closed_form(after, speed)
-    off = np.abs(force[wave] / exact[wave] - 1.0).max()
-    assert off < 1e-3, f"the force is off by {off:.2%} while the wave runs"  # 1.2e-4 measured; 5e-3 for a hundredth of stiffness
-    peak = force.max() / exact.max()  # 0.955 measured: implicit Euler smooths the end of the impact
-    assert 0.94 < peak < 1.0, f"the peak of the force is {peak:.3f} times that of the closed form"
+    off = abs(force[wave].mean() / exact[wave].mean() - 1.0)
+    assert off < 1.5e-3, f"the force is off by {off:.2%} while the wave runs"  # 7e-4 measured; 5e-3 for a hundredth of stiffness
+    rings = np.abs(force[wave] / exact[wave] - 1.0).max()
+    assert rings < 0.06, f"the force of a step is off by {rings:.1%}"  # 0.051 measured
+    peak = force.max() / exact.max()  # 1.005 measured
+    assert 0.98 < peak < 1.03, f"the peak of the force is {peak:.3f} times that of the closed form"
     lasts = (t[last] - t[first]) / CONTACT
     assert 1.0 < lasts < 1.04, f"the impact lasts {lasts:.3f} times as long as the wave runs"
+    leaves = -momentum[last] / momentum[first]
+    assert 0.97 < leaves < 1.0, f"the bar leaves with {leaves:.3f} of its speed"  # 0.981 measured

@@ -79,7 +79,7 @@ def drop_force() -> np.ndarray:
     with simulator(demo) as sim:
         t, force, momentum = demo.record(sim)
         first, last, speed = demo.impact(t, force, momentum)
-    shown, fine = slice(first - 20, last + 40), np.linspace(-0.1, 1.3, 2000) * demo.CONTACT
+    shown, fine = slice(first - 20, last + 60), np.linspace(-0.1, 1.3, 2000) * demo.CONTACT
     figure = Figure((7.0, 3.2), dpi=100, layout="constrained")
     axes = figure.subplots()
     axes.plot(1e3 * (t - t[first])[shown], force[shown], color="tab:blue", label="sim.contact_force")

@@ -37,6 +37,7 @@ class SweepWork:
     best: Any  # 3-vectors: the best impulses so far
     sweep_start: Any  # 3-vectors: impulses at the start of the sweep
     previous: Any  # 3-vectors: impulses after the previous sweep, before extrapolation
+    idle: Any  # i32: 1 for contacts that were open without an impulse at the last check: Gauss-Seidel skips them until the next
     term: Any  # 2-vectors: contributions of each contact to two sums
     partial: Any  # (CHUNKS) 2-vectors: sums over chunks of the contacts
     order: Any  # i32: contacts in sweep order
@@ -102,7 +103,7 @@ class ContactProblem:
     normal: Any = None  # 3-vectors: from b to a
     tangent: Any = None  # 3-vectors: t1; t2 = normal x t1
     inverse_mass: Any = None  # (n_nodes) 3-vectors [1/kg], 0 on constrained axes
-    w: Any = None  # (n_nodes) 3-vectors [m/s]: M^-1 J^T r
+    w: Any = None  # (n_nodes) 3-vectors [m/s]: M^-1 J^T r at the nodes of contacts
     by_node: Lists | None = None  # of the entries of each node, in `entry`
     entry: Any = None  # (n_entries) i32
     # of detected contacts, see `build`
@@ -186,7 +187,7 @@ def _solver_fields(arena: FieldArena, n: int, serial: bool) -> dict[str, Any]:
         **_fields(arena, "best sweep_start previous", ti.f64, n, 3),
         **_fields(arena, "term", ti.f64, n, 2),
         **_fields(arena, "partial", ti.f64, CHUNKS, 2),
-        **_fields(arena, "order colour", ti.i32, n),
+        **_fields(arena, "order colour idle", ti.i32, n),
         **_fields(arena, "state", ti.f64, VERDICT + 1),
         **_fields(arena, "history", ti.f64, HISTORY),
     )
@@ -320,9 +321,17 @@ def residual_of(sums):
 
 @ti.func
 def update_velocities(problem: ti.template()):
-    """Set w = M^-1 J^T r over nodes; does nothing if W is a matrix."""
-    if ti.static(not problem.matrix):
-        ti.loop_config(serialize=problem.serial)
+    """Set w = M^-1 J^T r at the nodes of contacts; does nothing if W is a matrix. On one thread each contact adds its impulse."""
+    if ti.static(not problem.matrix and problem.serial):
+        ti.loop_config(serialize=True)
+        for c in range(problem.count[0]):
+            for e in range(problem.first[c], problem.first[c] + problem.arity[c]):
+                problem.w[problem.node[e]] = dvec(0.0)
+        ti.loop_config(serialize=True)
+        for c in range(problem.count[0]):
+            if (problem.r[c] != 0.0).any():
+                add_impulse(problem, c, problem.r[c])
+    elif ti.static(not problem.matrix):
         for i in range(problem.n_nodes):
             problem.w[i] = problem.inverse_mass[i] * impulse_on(problem, i)
 

@@ -41,7 +41,11 @@ def sweep(problem: ti.template(), method: ti.template()):
             _swap(problem, c)
     else:
         for k in range(problem.count[0]):
-            _relax(problem, problem.sweep.order[k])
+            c = problem.sweep.order[k]
+            if problem.sweep.idle[c] == 1:
+                problem.sweep.sweep_start[c] = problem.r[c]
+            else:
+                _relax(problem, c)
 
 
 def sweep_parallel(problem: ContactProblem, method: str, n_colours: int) -> None:
@@ -59,8 +63,9 @@ def _relax(problem: ti.template(), c):
     r = problem.r[c]
     problem.sweep.sweep_start[c] = r
     new = prox(_step(problem, c), problem.friction[c])
-    add_impulse(problem, c, new - r)
-    problem.r[c] = new
+    if (new != r).any():
+        add_impulse(problem, c, new - r)
+        problem.r[c] = new
 
 
 @ti.func

@@ -30,6 +30,7 @@ from taisoft.contact.build import (
 from taisoft.contact.problem import build_node_problem, index_nodes
 from taisoft.dynamics.contact_measures import DEEP_PENETRATION, DEPTH, RELATIVE_PENETRATION, ContactMeasures, Crossing
 from taisoft.dynamics.contact_paths import ContactPaths
+from taisoft.dynamics.far_apart import FarApart
 from taisoft.dynamics.misplaced import NO_SUMS, Misplacement
 from taisoft.dynamics.part_length import PARTS
 from taisoft.dynamics.readout import (
@@ -79,6 +80,7 @@ class ContactStep:
         self.measures = ContactMeasures(self.detection, self._lasting)
         self.paths = ContactPaths(simulation, self.detection, self._lasting)
         self.misplaced = Misplacement(simulation, self.detection)
+        self.far = FarApart(simulation, self.detection)
         detection = self.detection
         is_flat = detection.overlay is None and all(isinstance(one.shape, HalfSpace) for one in scene.obstacles)
         offset = self.STATIC_OFFSET if static and is_flat else self.OFFSET
@@ -141,6 +143,7 @@ class ContactStep:
     def motion_changed(self) -> None:
         """Discard the search, after an obstacle or nodes were commanded to move."""
         self._searched = None
+        self.far.forget()
 
     @property
     def n_contacts(self) -> int:
@@ -166,6 +169,7 @@ class ContactStep:
     def discard_search(self, with_impulses: bool) -> None:
         """Discard the search of a substep that was undone; the impulses that are left warm-start the next attempt."""
         self._searched = self._measured_end = None
+        self.far.forget()
         if with_impulses:
             self.problem.count[0], self._last_time, self._search_counts = 0, 0.0, (0, 0)
 
@@ -208,6 +212,7 @@ class ContactStep:
         self.misplaced.start_step()
         self.crossing, self.last_crossing = 0.0 if self.paths.none_cross else None, Crossing()
         self._searched = self._measured_end = None
+        self.far.forget()
         self._indexed = True  # so that the next step rebuilds the node index, even without contacts
 
     def _gap_targets(self) -> tuple[float, float, float, float]:
@@ -235,9 +240,24 @@ class ContactStep:
         simulation, detection, searched = self.simulation, self.detection, self._searched
         if searched is None or searched[1] != dt or abs(searched[0] - time) > 1e-6 * dt:
             self._searched = None
+            self.far.forget()
             self._find(time, dt, prescribed=simulation.prescribed_moves(time + dt))
             self._searched = time, dt
         return detection.counts.contacts
+
+    def is_far(self, time: float, dt: float) -> bool:
+        """Return whether nothing can touch in an explicit step of dt from a time, see `far_apart`: it needs no search."""
+        now, counts, far = self.simulation.now, self.detection.counts, self.far
+        if not far.covers(time + dt):
+            if not self._explicit or self.n_contacts or counts.active or counts.found or not now.none_cross or self._has_paths:
+                return False
+            if not far.is_due():
+                return False
+            self._searched = None
+            far.search(time, dt)
+        if far.is_known:
+            self._measured_end, self._last_time, self._search_counts, self.had_impact = None, dt, (0, 0), False
+        return far.is_known
 
     def _find(self, time: float, dt: float, **along) -> None:
         """Call `Detection.find`; where nothing crosses, implicit steps drop what may never touch."""
@@ -308,9 +328,10 @@ class ContactStep:
 
     def start_step(self, time: float, dt: float) -> None:
         """Begin a step of dt from a time. Penetration that exists there is not new."""
-        self.search(time, dt)
-        self.relative_penetration = float(self.measures.closing[RELATIVE_PENETRATION])
-        self.relative_penetration = max(self.relative_penetration, self.initial_crossing())
+        self.relative_penetration = 0.0
+        if not self.is_far(time, dt):
+            self.search(time, dt)
+            self.relative_penetration = max(float(self.measures.closing[RELATIVE_PENETRATION]), self.initial_crossing())
         self._deepest, self._most_crossed = DEEP_PENETRATION, CROSSED
         self._raise_limits()
         self._substep_fraction, self._step_dt, self.dropped = 1.0, dt, 0
@@ -454,6 +475,9 @@ class ContactStep:
 
         The search there is reused until the next part begins.
         """
+        if self.far.is_known:
+            self.relative_penetration = 0.0
+            return 0.0
         ended = self._measured_end
         if ended is not None and ended[1] == dt and abs(ended[0] - time) <= 1e-6 * dt:
             return self._depth

@@ -108,12 +108,17 @@ class ContactExplicitStepper(ExplicitStepper):
         Return the contact solver's result, None without contacts.
         """
         simulation, contact, good = self.simulation, self.contact, self.good
-        contact.search(time, dt)
+        is_far = contact.is_far(time, dt)
+        if not is_far:
+            contact.search(time, dt)
         if not contact.paths.none_cross and contact.measures.closing_ratio > 1.0:
             raise SimulationError(f"step {step}: {contact.measures.describe_fast_closing(dt)}")
         contact.start_substep(dt)
         for tries in range(MAX_PASSAGES + 1):
-            result = self._solve_and_move(step, time, dt)
+            result = self._solve_and_move(step, time, dt, is_far)
+            if is_far and contact.far.stays():
+                break
+            is_far = False
             way = contact.certify(time, dt, good)
             if way == FREE:
                 break
@@ -133,15 +138,18 @@ class ContactExplicitStepper(ExplicitStepper):
         self.simulation.now.copy_history_from(self.good)
         self.simulation.move_branches(dt)
 
-    def _solve_and_move(self, step: int, time: float, dt: float) -> SolveResult | None:
-        """Solve for the impulses of the contacts found, and move; return the contact solver's result, None without contacts."""
+    def _solve_and_move(self, step: int, time: float, dt: float, is_far: bool) -> SolveResult | None:
+        """Solve for the impulses of the contacts found, and move; return the contact solver's result, None without contacts.
+
+        is_far: whether nothing can touch.
+        """
         model, work, contact = self.simulation.model, self.work, self.contact
         self.simulation.set_load_time(time)
         if work.verlet and self.acceleration_stale:
             explicit.run_elements(model)
             explicit.find_acceleration(model, work)
         self.acceleration_stale = False
-        n = contact.begin(time, dt)
+        n = 0 if is_far else contact.begin(time, dt)
         predict(model, work, dt)
         result = None
         if n:

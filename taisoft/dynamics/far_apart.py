@@ -1,0 +1,79 @@
+"""Explicit sub-steps in which nothing can touch, known from one search along straight paths of many of them.
+
+A search along x + t v, t up to many dt, finds no contact, and the box of no triangle meets another collider. The boxes hold the
+whole paths and are grown by half the reach, so surfaces stay apart, whatever the times, as long as no vertex leaves its path by
+half the reach. MAX_DEVIATION leaves as much again: what a search in a single sub-step would find there carries no impulse. So the
+results are the same as with a search in each. Weak: bodies whose boxes meet, and those tested against themselves, gain nothing.
+"""
+
+import taichi as ti
+
+from taisoft.backend.runtime import kernel
+from taisoft.collision.detector import Detection
+from taisoft.collision.near_list import leaving
+from taisoft.dynamics.simulation_state import SimulationState
+from taisoft.fem.state import DEVIATION
+
+MOST, FEWEST = 64, 4  # sub-steps of a search; where one fails, a quarter as many are tried
+PAUSE = 16  # sub-steps after which they are tried again
+MAX_DEVIATION = 0.25  # of the reach: how far a vertex may leave its path
+
+
+@kernel
+def find_deviation(m: ti.template(), s: ti.template()):
+    """Find how far a vertex has left its searched path. scalars: DEVIATION."""
+    ti.loop_config(serialize=True)
+    for _ in range(1):
+        m.state.scalars[DEVIATION] = 0.0
+    ti.loop_config(serialize=m.on_cpu)
+    for k in range(s.n_verts):
+        if s.node[k] >= 0:
+            square = leaving(m.state.x[s.node[k]] - s.x[k], s.move[k]).norm_sqr()
+            if not square <= m.state.scalars[DEVIATION]:  # also if it is not a number
+                ti.atomic_max(m.state.scalars[DEVIATION], ti.select(square >= 0.0, square, ti.math.inf))
+
+
+class FarApart:
+    """Searches for many sub-steps, and how long what they say holds."""
+
+    def __init__(self, simulation: SimulationState, detection: Detection):
+        self._simulation, self._detection = simulation, detection
+        self._limit = (MAX_DEVIATION * detection.reach) ** 2  # [m^2]
+        self._until, self._length, self._pause = 0.0, MOST, 0
+
+    def forget(self) -> None:
+        """Discard what is known, after another search or a change of the state."""
+        self._until = 0.0
+
+    @property
+    def is_known(self) -> bool:
+        """Whether nothing touches at the end of the last sub-step."""
+        return self._until > 0.0
+
+    def covers(self, end: float) -> bool:
+        """Return whether it is known that nothing can touch until a time [s]."""
+        return end <= self._until
+
+    def is_due(self) -> bool:
+        """Return whether to search now. Called once a sub-step."""
+        self._pause = max(self._pause - 1, 0)
+        return self._pause == 0
+
+    def search(self, time: float, dt: float) -> None:
+        """Search from a time [s] for as many sub-steps of dt as nothing can touch in, instead of the detection's last search."""
+        self.forget()
+        while self._length >= FEWEST:
+            self._detection.find(time, self._length * dt, none_cross=True)
+            if self._detection.counts.active == 0 and self._detection.counts.found == 0:
+                self._until, self._length = time + (self._length + 0.5) * dt, MOST
+                return
+            self._length //= 4
+        self._length, self._pause = MOST, PAUSE
+
+    def stays(self) -> bool:
+        """Return whether all vertices are near their paths at the end of a sub-step; if not, nothing is known any more."""
+        model = self._simulation.model
+        find_deviation(model, self._detection.surface)
+        if not model.state.scalars[DEVIATION] <= self._limit:
+            self.forget()
+        return self.is_known
