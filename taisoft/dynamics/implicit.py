@@ -265,6 +265,6 @@ class ImplicitStepper(ImplicitStages):
             step.problems.append(self.contact.paths.held_back)
         if self._multipliers is not None:
             step.problems += self._multipliers.problems()
-        if name:
+        if name and not step.on_budget:
             step.problems.append(f"forces on {name} are unbalanced by {worst:.2g} of their size, beside larger forces elsewhere")
         return step
