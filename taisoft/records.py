@@ -53,7 +53,7 @@ class StepReport:
     dissipated: float = 0.0  #: by Maxwell branches since the start [J]
     converged: bool = True  #: residuals are within their tolerances
     on_budget: int = 0  #: 1 where the step ended at its budget of wall time before it converged, else 0
-    last_correction: float = 0.0  #: largest displacement by the last Newton iteration of such a step, about its error [m]
+    last_correction: float = 0.0  #: displacement by such a step's last iteration and by holding back, about its error [m]
     problems: list[str] = field(default_factory=list)  #: sentences
     details: dict[str, float] = field(default_factory=dict)  #: of a run with `details`, at the end, by heading in steps.csv
 

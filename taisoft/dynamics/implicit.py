@@ -194,16 +194,20 @@ class ImplicitStepper(ImplicitStages):
 
         Raise SimulationError if contacts close too fast even for the shortest part of a step of dt.
         """
-        paths, held = self.contact.paths, 0.0
+        paths, held, is_over = self.contact.paths, 0.0, self._is_over()
+        end = self.simulation.state()[0] if self.solver.budget.ran_out else None
         if not result.free:
-            if not self._is_over():
+            if not is_over:
                 self.contact.refuse_fast_closing(dt)
             if paths.hold_back(self.start.x):
                 self.n_previous, result = 0, replace(result, converged=False)
-        if not result.converged and self._is_over():
+        if not result.converged and is_over:
             held = 1.0 - self._hold_back_inverted()
             if held and paths.find():
                 paths.hold_back(self.start.x)
+        if end is not None:
+            moved = float(np.linalg.norm(self.simulation.state()[0] - end, axis=1).max())
+            result = replace(result, correction=result.correction + moved)
         return result, held
 
     def _hold_back_inverted(self) -> float:

@@ -19,7 +19,7 @@ class StageResult:
     multigrid_solves: int = 0
     imbalance: str = ""  # what is out of balance, in words, if it has not converged
     free: bool = True  # whether nothing passes through anything on the way, and all is finite
-    correction: float = 0.0  # displacement by the last Newton iteration, if time was out before it converged [m]
+    correction: float = 0.0  # displacement by the last Newton iteration and by holding back, if time was out [m]
 
 
 @dataclass
