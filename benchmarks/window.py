@@ -4,10 +4,11 @@ taisoft bench window [--quick] [--only NAME,...] [--out FILE.json]
 
 Every demo with contacts and up to 5,000 tets runs in a window on a virtual display (Xvfb), drawn by the Vulkan driver of this
 machine, which may be one in software. First a run without a window, which also compiles, is timed; then the same time is run in
-the window by the clock, then a body is dragged to and fro by the mouse (xdotool). Speeds are simulated over wall time: the
-window's is 1 at most. The latency is the wall time from the last look at the mouse that did not see a movement to a picture of a
-state whose step has used it. Run nothing else meanwhile. Exit status: 0, or 1 if fewer than 20 pictures per second are shown, or
-the latency is above 100 ms where the simulation keeps up with the clock.
+the window by the clock, and a body is dragged to and fro by the mouse (xdotool); then both once more, with a budget of wall time
+for its implicit steps. Speeds are simulated over wall time: the window's is 1 at most. The latency is the wall time from the last
+look at the mouse that did not see a movement to a picture of a state whose step has used it. Run nothing else meanwhile.
+Exit status: 0, or 1 if fewer than 20 pictures per second are shown, or the latency is above 100 ms where the simulation keeps up
+with the clock, without a budget.
 """
 
 import sys
@@ -77,7 +78,14 @@ def window_table(rows: list[dict]) -> str:
         ("drag after [ms]", lambda row: f"{1e3 * latency(row, 0.5):.0f}"),
         ("95 %", lambda row: f"{1e3 * latency(row, 0.95):.0f}"),
     )
-    return table(rows, columns)
+    with_budget = (
+        ("speed with budget", lambda row: f"{row['budget']['speed']:.2f}"),
+        ("longest step with budget over the median", lambda row: f"{row['budget']['longest_step'] / row['budget']['step']:.1f}"),
+        ("steps ended on budget [%]", lambda row: f"{100 * row['budget']['ended']:.0f}"),
+        ("largest residual", lambda row: f"{row['budget']['residual']:.1g}"),
+        ("95 % of drags with budget [ms]", lambda row: f"{1e3 * latency(row['budget'], 0.95):.0f}"),
+    )
+    return table(rows, columns + with_budget if all("budget" in row for row in rows) else columns)  # older results have none
 
 
 def limits_of(rows: list[dict]) -> list[Limit]:

@@ -1,5 +1,6 @@
 """Changes of a running simulation by its user: each function is a method of `Simulator`, whose class body lists them."""
 
+import dataclasses
 import warnings
 from typing import TYPE_CHECKING
 
@@ -9,7 +10,7 @@ from taisoft.queries import body_index, check_rows, nodes_of
 from taisoft.scene.body_loads import activate_fibres
 from taisoft.scene.connections import check_exact
 from taisoft.scene.plan import CHANGEABLE, change_load, change_material, change_tendon
-from taisoft.settings import FIXED, NAMES, check_dt
+from taisoft.settings import FIXED, NAMES, check_budget, check_dt
 
 if TYPE_CHECKING:
     from taisoft.simulator import Simulator
@@ -53,6 +54,17 @@ def set_dt(self: "Simulator", value: float) -> None:
         return
     check_stability(self, value, stacklevel=4)
     self._host().set_dt(value)
+
+
+def budget(self: "Simulator") -> float | None:
+    """Wall time for an implicit step in time [s], None: any; a new value takes effect with the next step."""
+    return self.settings.budget
+
+
+def set_budget(self: "Simulator", value: float | None) -> None:
+    """Set the budget."""
+    self.__dict__["settings"] = check_budget(dataclasses.replace(self.settings, budget=value))
+    self._host().state.budget = self.settings.budget
 
 
 def check_stability(sim: "Simulator", dt: float, stacklevel: int = 3) -> None:

@@ -32,7 +32,7 @@ from taisoft.settings import NAMES, plan_of
 if TYPE_CHECKING:
     from taisoft.simulator import Simulator
 
-KIND, FORMAT = "taisoft checkpoint", 23  # increment FORMAT with every change of a file's content
+KIND, FORMAT = "taisoft checkpoint", 24  # increment FORMAT with every change of a file's content
 PARTS = ("settings", "numbers", "start", "fingerprint", "state", "notes")  # of the header, each a table
 
 

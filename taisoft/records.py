@@ -52,6 +52,8 @@ class StepReport:
     loads: float = 0.0  #: of dead loads, -sum f.x [J]
     dissipated: float = 0.0  #: by Maxwell branches since the start [J]
     converged: bool = True  #: residuals are within their tolerances
+    on_budget: int = 0  #: 1 where the step ended at its budget of wall time before it converged, else 0
+    last_correction: float = 0.0  #: displacement by such a step's last iteration and by holding back, about its error [m]
     problems: list[str] = field(default_factory=list)  #: sentences
     details: dict[str, float] = field(default_factory=dict)  #: of a run with `details`, at the end, by heading in steps.csv
 
@@ -66,7 +68,7 @@ class StepReport:
         texts = [f"{n} {name}" for name, n in counts.items() if n]
         texts += [f"residual {self.residual:.2g}"] if self.residual else []
         texts += [f"min J {self.min_volume_ratio:.4g}", f"kinetic {self.kinetic:.4g} J", f"elastic {self.elastic:.4g} J"]
-        end = "" if self.converged else ", not converged"
+        end = "" if self.converged else ", on budget" if self.on_budget else ", not converged"
         return f"StepReport(t = {self.time:.6g} s: {', '.join(texts)}{end})"
 
 

@@ -250,7 +250,14 @@ def _check_final_overlap(sim: "Simulator", report: RunReport) -> None:
 def _summarize_steps(report: RunReport) -> None:
     """Add problems and the status: any step that dropped contacts, inverted tets or did not converge degrades the run."""
     steps = report.step_reports
-    if unconverged := [s for s in steps if not s.converged]:
+    if cut := [s for s in steps if s.on_budget]:
+        worst, corrections = max(cut, key=lambda s: s.residual), [s.last_correction for s in cut]
+        report.degrade(
+            f"{len(cut)} of {len(steps)} steps ended on budget; the worst, at t = {worst.time:.4g} s, at a relative residual of "
+            f"{worst.residual:.2e}; the last Newton corrections, about the errors, are up to {max(corrections):.2g} "
+            f"m, {sum(corrections):.2g} m together"
+        )
+    if unconverged := [s for s in steps if not (s.converged or s.on_budget)]:
         worst = max(unconverged, key=lambda s: max(s.residual, s.contact_residual))
         report.degrade(
             f"{len(unconverged)} of {len(steps)} steps did not converge; the worst, at t = {worst.time:.4g} s, "

@@ -36,6 +36,7 @@ class Settings:
     draggable: bool = False
     tolerance: float | None = None  # of a run's positions, over the largest excursion
     ramp: float | None = None  # [s] in which constant loads and gravity grow from 0; of statics only
+    budget: float | None = None  # [s] of wall time for an implicit step in time
 
     @property
     def explicit(self) -> bool:
@@ -50,7 +51,7 @@ class Settings:
 
 NAMES = tuple(field.name for field in dataclasses.fields(Settings))
 TOLERANCES = ("newton_tolerance", "linear_tolerance", "contact_tolerance")
-FIXED = ("dt", "precision", "arch")  # settings that `Simulator.rebuild` is not for: dt is assigned, the others never change
+FIXED = ("dt", "budget", "precision", "arch")  # settings that `Simulator.rebuild` is not for: assigned, or never changed
 
 
 def check_settings(scene: Scene, **given) -> Settings:
@@ -72,7 +73,7 @@ def check_settings(scene: Scene, **given) -> Settings:
     _check_multipliers(settings, scene)
     if settings.tolerance is not None:
         refuse_robots(scene, "tolerance")
-    return _check_static(settings, scene)
+    return _check_static(check_budget(settings), scene)
 
 
 def refuse_robots(scene: Scene, what: str) -> None:
@@ -95,6 +96,17 @@ def contact_solvers(integrator: str) -> tuple[str, ...]:
 def check_dt(dt) -> float:
     """Return dt as a float; SimulationError unless it is a finite number above 0."""
     return checks.number(dt, "dt", above=0.0, unit="s", error=SimulationError)
+
+
+def check_budget(settings: Settings) -> Settings:
+    """Return the settings with the budget as a float. Raises SimulationError unless it is at least 0, and without a tolerance."""
+    if settings.budget is None:
+        return settings
+    if settings.tolerance is not None:
+        raise SimulationError("a budget ends steps at any error, and a tolerance bounds the error: take one of them")
+    return dataclasses.replace(
+        settings, budget=checks.number(settings.budget, "budget", minimum=0.0, unit="s", error=SimulationError)
+    )
 
 
 def check_count(name: str, value) -> int:

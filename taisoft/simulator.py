@@ -35,6 +35,9 @@ class Simulator(Guarded):
     None: the default of the precision, for linear solves adaptive. draggable: allow `drag`.
     tolerance: wanted error of positions in time over the largest excursion; `run` then chooses integrator and dt by pilots
     (`taisoft.estimation.tolerance`), whatever they were before, and tolerances that are None follow from it.
+    budget: wall time for an implicit step in time [s]. Where it is used up Newton's method ends at its last iterate, after one
+    iteration at least; bodies that would then pass through something, or invert, are held back. Such steps are reported as not
+    converged (`StepReport.on_budget`). Results then depend on the machine and its load.
     An explicit integrator refuses a dt above `stable_dt`; with allow_unstable it only warns.
     Raises SceneError for a scene that cannot be simulated, SimulationError for settings that cannot be met.
     """
@@ -62,6 +65,7 @@ class Simulator(Guarded):
         draggable: bool = False,
         tolerance: float | None = None,
         ramp: float | None = None,
+        budget: float | None = None,
     ):
         given = locals()  # of the arguments alone, as long as this is the first line
         self.settings = check_settings(scene, **{name: given[name] for name in NAMES})
@@ -190,6 +194,7 @@ class Simulator(Guarded):
     # --- changes: changes.py ------------------------------------------------------------------------------------------
 
     dt = property(changes.dt, changes.set_dt)
+    budget = property(changes.budget, changes.set_budget)
     reset = changes.reset
     set_state = changes.set_state
     set_gravity = changes.set_gravity

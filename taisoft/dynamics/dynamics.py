@@ -69,7 +69,7 @@ class Dynamics:
     def _build(self, scene: Scene, settings: Settings, plan: Plan) -> None:
         model, layout = build_model(scene, self.runtime, self.arena, plan.on)
         self.state = SimulationState(scene, self.runtime, self.arena, model, layout, DirichletConditions(scene, layout))
-        self.state.ramp = settings.ramp or 0.0
+        self.state.ramp, self.state.budget = settings.ramp or 0.0, settings.budget
         self.contact = None
         if plan.on["contact_forces"]:
             from taisoft.dynamics.contact import ContactStep

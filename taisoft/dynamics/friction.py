@@ -72,6 +72,7 @@ class Friction:
     FINER = 0.1  # times the |r| that ends the steps under one multiplier, once multipliers are extrapolated
     ROUNDING = 4.0  # times the floor: |r| that may be rounding, as strains grow (up to 2.8 times was measured, in a thin sheet)
     MAX_UPDATES = 200
+    LEAST_SOLVES = 5  # out of time, too: with 1 energies rise, with 3 bodies are held back thrice as often
     R_EXTRAPOLATED = 5.0  # R over the r-factors from then on: iterations vary little from 5 to 7 and increase outside
     MIN_R, MAX_R, MANY_STEPS = 0.3, 100.0, 5  # bounds of R over the r-factors; steps that halve it
     EASED = 0.25  # factor on R without friction once the laws hold, so that the linear solves become easier
@@ -109,6 +110,8 @@ class Friction:
                 law_before, n_steps, rounding, inner, updates = law, 0, False, cls.PROGRESS * r, updates + 1
             elif solves >= goal.max_solves or system.duration_of(linear, solves + updates) > patience:
                 break
+            elif solves >= cls.LEAST_SOLVES and system.budget.is_out_of_time():
+                break
             else:
                 found = system.solve_linear(max(goal.forcing, goal.later if solves else 0.0))
                 solves, linear, n_steps = solves + 1, linear + found.iterations, n_steps + 1
@@ -117,7 +120,7 @@ class Friction:
                 before, r = r, system.advance(scale)
                 rounding = r <= cls.ROUNDING * system.floor and r > 0.5 * before
         system.r_scale = FIRST_R
-        if not (converged or negative):
+        if not (converged or negative or system.budget.ran_out):
             if (found := cls._solve_directly(system, goal, r, first=True)) is not None:
                 return found._replace(solves=solves + 1, linear=linear, updates=updates)
             if patience < math.inf and solves < goal.max_solves:

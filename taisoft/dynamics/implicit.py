@@ -6,8 +6,9 @@ same (`ContactStep.certify`), or if Newton's method failed and shorter parts may
 bodies that would still pass through something are held back. Where surfaces cross already, contacts that close fast limit the
 length, and motion too fast for the shortest part is refused.
 
-Where the Newton iterations of the step are used up (`newton_budget`), the part under way is the last: what passes through
-something on its way, or inverts tets, is held back, and in the rest of the step only what is prescribed moves.
+Where the step's Newton iterations or its wall time are used up (`newton_budget`), nothing is tried again: what passes through
+something on its way, or inverts tets, is held back. Out of iterations, only what is prescribed moves in the rest of the step; out
+of time, the rest is one more part, of one iteration.
 """
 
 import math
@@ -27,6 +28,7 @@ from taisoft.fem.measure import measure
 from taisoft.fem.state import N_INVERTED
 from taisoft.settings import Settings
 
+MAX_LATE = 1  # attempts, out of time, after which what they met is held back
 RUNAWAY = 1.9  # sizes that a piece has moved in a static part without equilibrium: nothing holds it
 
 
@@ -60,7 +62,7 @@ class ImplicitStepper(ImplicitStages):
     def advance(self, n: int, dt: float) -> StepResult:
         """Take one step of dt, whatever n. Raise SimulationError if it fails; the state is then the one before."""
         self.first.copy_from(self.simulation.now)
-        self.solver.budget.begin()
+        self.solver.budget.begin(None if self.scheme.c == 0.0 else self.simulation.budget)
         dropped: list[StageResult] = []
         for is_last in (False, True):
             try:
@@ -75,7 +77,7 @@ class ImplicitStepper(ImplicitStages):
                     raise
                 self._length = length  # an error where only convergence was missing: the step is taken without halving for that
                 length.give_up()
-        if self._is_spent():
+        if self._is_over():
             self._length.give_up()
         self.last = merge(kept)
         return self._report(count_all(self.last, dropped), len(kept), held)
@@ -89,7 +91,8 @@ class ImplicitStepper(ImplicitStages):
         contact.start_step(time, dt)
         while left:
             now, is_rest = time + (1.0 - left / PARTS) * dt, self._is_spent()
-            units = left if is_rest else contact.most_units(now, dt, min(left, length.units(dt)))
+            longest = left if self._is_over() else min(left, length.units(dt))
+            units = left if is_rest else contact.most_units(now, dt, longest)
             part = units / PARTS * dt
             result = self._hold(now, part) if is_rest else self._attempt(now, part)
             # linearly implicit stages do not iterate: shorter ones need not converge sooner
@@ -98,14 +101,16 @@ class ImplicitStepper(ImplicitStages):
                 converged = (converged or result.at_rounding) and self._count_inverted() == 0
             if self.scheme.c == 0.0 and not result.converged:
                 self._refuse_runaway()
-            if not self._is_spent() and length.should_halve(result.free, converged, units):
-                if not (is_finite := math.isfinite(result.residual)):
+            is_finite = math.isfinite(result.residual)
+            is_last = self._is_over() if is_finite else self._is_spent()
+            if not is_last and length.should_halve(result.free, converged, units):
+                if not is_finite:
                     self.solver.linear_solver.forget()
                 self._undo(discard_impulses=result.free or not is_finite)
                 length.halve(units, dt)
                 dropped.append(result)
                 continue
-            if not math.isfinite(result.residual):
+            if not is_finite:
                 raise SimulationError(f"step {self.simulation.step_count + 1}: {result.imbalance}")
             result, part_held = (result, 1.0) if is_rest else self._hold_back(result, dt)
             held += units / PARTS * part_held
@@ -121,7 +126,7 @@ class ImplicitStepper(ImplicitStages):
     def _attempt(self, time: float, dt: float) -> StageResult:
         """Solve the stage of a part of dt from a time [s]. What its way meets becomes contacts, and the stage is solved on from
         the velocities reached."""
-        contact, results, start, n_previous = self.contact, [], None, self.n_previous + 1
+        contact, results, start, n_previous, n_late = self.contact, [], None, self.n_previous + 1, 0
         self.start.copy_rest_from(self.simulation.now)
         contact.start_substep(dt)
         if self.scheme.c == 0.0 and not contact.idle and contact.detection.overlay is None:
@@ -135,7 +140,10 @@ class ImplicitStepper(ImplicitStages):
                 return count_all(result, results[:-1])
             way = contact.certify(time, dt, self.start)
             is_hopeless = not (result.converged or self.scheme.one_iteration or self.scheme.c == 0.0)
-            if way != MET or len(results) > MAX_PASSAGES or is_hopeless or self._is_spent():
+            is_late = self.solver.budget.is_out_of_time()  # an iterate that has not converged may then be near
+            n_late += is_late
+            is_last = n_late > MAX_LATE or (is_hopeless and not is_late) or self._is_spent()
+            if way != MET or len(results) > MAX_PASSAGES or is_last:
                 return count_all(replace(result, free=way == FREE), results[:-1])
             if result.converged or self.scheme.c > 0.0:  # else what falls starts again, above what it meets
                 start = self.simulation.velocities()
@@ -166,6 +174,10 @@ class ImplicitStepper(ImplicitStages):
         """Whether the step has no Newton iterations left."""
         return not self.solver.budget.left
 
+    def _is_over(self) -> bool:
+        """Whether the step has no Newton iterations or no time left, so that nothing is tried again."""
+        return self._is_spent() or self.solver.budget.is_out_of_time()
+
     def _hold(self, time: float, dt: float) -> StageResult:
         """Take a part in which only what is prescribed moves."""
         self.start.copy_rest_from(self.simulation.now)
@@ -177,21 +189,25 @@ class ImplicitStepper(ImplicitStages):
         return StageResult(0.0, 0, 0.0, False, False, imbalance=result.imbalance)
 
     def _hold_back(self, result: StageResult, dt: float) -> tuple[StageResult, float]:
-        """Hold back what passes through something on the way of a part that is kept, and, where the iterations are used up, what
-        inverts tets; return the result, and the fraction of the motion that is held back for that.
+        """Hold back what passes through something on the way of a part that is kept, and, if the step is over, what inverts
+        tets; return the result, and the fraction of the motion that is held back for that.
 
         Raise SimulationError if contacts close too fast even for the shortest part of a step of dt.
         """
-        paths, held = self.contact.paths, 0.0
+        paths, held, is_over = self.contact.paths, 0.0, self._is_over()
+        end = self.simulation.state()[0] if self.solver.budget.ran_out else None
         if not result.free:
-            if not self._is_spent():
+            if not is_over:
                 self.contact.refuse_fast_closing(dt)
             if paths.hold_back(self.start.x):
                 self.n_previous, result = 0, replace(result, converged=False)
-        if self._is_spent() and not result.converged:
+        if not result.converged and is_over:
             held = 1.0 - self._hold_back_inverted()
             if held and paths.find():
                 paths.hold_back(self.start.x)
+        if end is not None:
+            moved = float(np.linalg.norm(self.simulation.state()[0] - end, axis=1).max())
+            result = replace(result, correction=result.correction + moved)
         return result, held
 
     def _hold_back_inverted(self) -> float:
@@ -222,7 +238,7 @@ class ImplicitStepper(ImplicitStages):
 
     def _report(self, result: StageResult, n_parts: int, held: float) -> StepResult:
         """What is reported of a step. held: the fraction of it in which motion was held back for lack of iterations."""
-        worst, name = result.unbalanced
+        (worst, name), budget = result.unbalanced, self.solver.budget
         step = StepResult(
             substeps=n_parts,
             newton_iterations=round(result.newton_iterations),
@@ -232,23 +248,27 @@ class ImplicitStepper(ImplicitStages):
             residual=max(result.residual, worst) if name else result.residual,
             contact_residual=result.contact_residual,
             converged=result.converged and not name,
+            last_correction=result.correction,
         )
+        step.on_budget = int(budget.ran_out and not step.converged)
         is_solved = result.residual <= self.tolerance and result.contact_residual <= self.contact_tolerance
         if not (step.converged or (self.contact.paths.held_back and is_solved)):
             step.problems.append(
-                f"Newton stopped after {step.newton_iterations} iterations at a relative residual of {step.residual:.2e}"
+                "on budget: " * step.on_budget
+                + f"Newton stopped after {step.newton_iterations} iterations at a relative residual of {step.residual:.2e}"
                 + (f" and a contact residual of {step.contact_residual:.2e}" if self.contact.n_contacts else "")
+                + (f"; its last correction was {step.last_correction:.2g} m" if step.on_budget else "")
                 + (f"; {result.imbalance}" if result.imbalance else "")
             )
         if held > 0.0:
             step.problems.append(
-                f"{self.solver.budget.limit} Newton iterations, the most in a step, were not enough: the motion in the last "
-                f"{100.0 * held:.3g} % of the step was held back"
+                ("the step's time was" if step.on_budget else f"{budget.limit} Newton iterations, the most in a step, were")
+                + f" not enough: the motion in the last {100.0 * held:.3g} % of the step was held back"
             )
         if self.contact.paths.held_back:
             step.problems.append(self.contact.paths.held_back)
         if self._multipliers is not None:
             step.problems += self._multipliers.problems()
-        if name:
+        if name and not step.on_budget:
             step.problems.append(f"forces on {name} are unbalanced by {worst:.2g} of their size, beside larger forces elsewhere")
         return step

@@ -149,8 +149,8 @@ class ImplicitStages:
         stage = replace(self._stage(scheme, dt, self.tolerance), renews=not bounces)
         result = solve_bouncing(solver, stage) if bounces else solve(solver, stage)
         if scheme.one_iteration and solver.pieces.several and result.converged and np.isfinite(result.residual):
-            result = self._balance(scheme, stage, result, may_repeat=not bounces)
-        if not result.converged:
+            result = self._balance(scheme, stage, result, may_repeat=not (bounces or solver.budget.is_out_of_time()))
+        if not (result.converged or solver.budget.ran_out):
             result = replace(result, imbalance=describe_imbalance(simulation, solver, self.contact))
         if scheme.midpoint:
             finish_midpoint(simulation.model, self.history)

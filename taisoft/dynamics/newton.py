@@ -92,6 +92,8 @@ class Newton:
             is_slow = not (self._is_balanced or self.r < decrease * self.lowest)
             self.n_slow = self.n_slow + 1 + self.is_projected if is_slow else 0
             self.lowest = min(self.lowest, self.r)
+            if not self._has_converged() and system.budget.is_out_of_time():
+                break
         return self._result(is_accepted)
 
     def _start_at_rest(self) -> None:
@@ -198,6 +200,7 @@ class Newton:
             system.contact_residual,
             (0.0, "") if converged else system.least_balanced(),
             self.multigrid,
+            correction=system.last_correction() if system.budget.ran_out and not converged else 0.0,
         )
 
     # --- an iteration -------------------------------------------------------------------------------------------------------

@@ -19,6 +19,7 @@ class StageResult:
     multigrid_solves: int = 0
     imbalance: str = ""  # what is out of balance, in words, if it has not converged
     free: bool = True  # whether nothing passes through anything on the way, and all is finite
+    correction: float = 0.0  # displacement by the last Newton iteration and by holding back, if time was out [m]
 
 
 @dataclass
@@ -39,6 +40,8 @@ class StepResult:
     min_volume_ratio: float = math.inf
     n_inverted: int = 0
     converged: bool = True
+    on_budget: int = 0
+    last_correction: float = 0.0
     problems: list[str] = field(default_factory=list)
 
 
@@ -62,6 +65,7 @@ def merge(results: list[StageResult]) -> StageResult:
         max(r.unbalanced for r in results),
         sum(r.multigrid_solves for r in results),
         max(results, key=lambda r: (not r.converged, r.residual)).imbalance,
+        correction=sum(r.correction for r in results),
     )
 
 

@@ -45,6 +45,7 @@ class SimulationState:
     now: StepState = field(init=False)
     drag: tuple[np.ndarray, np.ndarray] | None = None  # nodes (k,) and forces (k, 3) [N] of a drag spring
     ramp: float = 0.0  # [s] from the start, in which constant loads and gravity grow; statics only, as is:
+    budget: float | None = None  # wall time of an implicit step in time [s]
     at: float | None = None  # [s] when all that follows paths has the values towards which it grows, too; None: it follows them
     _loads: SceneLoads | None = None  # None: not computed, or outdated
     load_time: float | None = None  # of the loads on the device; None: several, or outdated

@@ -556,6 +556,11 @@ class StageSystem:
         self._same_matrix = True
         return solution
 
+    def last_correction(self) -> float:
+        """Return the largest displacement by y, the last change of v [m]."""
+        (y,) = download([self.work.pcg.y])
+        return self.stage.beta * float(np.linalg.norm(y, axis=1).max())
+
     # --- other queries ---------------------------------------------------------------------------------------------
 
     def assemble_damper(self) -> None:

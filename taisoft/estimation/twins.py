@@ -66,9 +66,9 @@ def other_steps(sim: "Simulator", steps: int) -> Iterator[Twin]:
     would be unstable."""
     if steps >= MIN_STEPS and not (sim.settings.explicit and 4.0 * sim.dt > STABLE_FRACTION * sim.stable_dt):
         for ratio in (2, 4):
-            yield Twin(f"dt = {ratio * sim.dt:.4g} s", sim._copy(dt=ratio * sim.dt), ratio, per=ratio)
+            yield Twin(f"dt = {ratio * sim.dt:.4g} s", sim._copy(dt=ratio * sim.dt, budget=None), ratio, per=ratio)
     else:
-        yield Twin(f"dt = {0.5 * sim.dt:.4g} s", sim._copy(dt=0.5 * sim.dt), 0.5, steps=2)
+        yield Twin(f"dt = {0.5 * sim.dt:.4g} s", sim._copy(dt=0.5 * sim.dt, budget=None), 0.5, steps=2)
 
 
 def tighter(sim: "Simulator") -> Twin | None:
@@ -80,7 +80,7 @@ def tighter(sim: "Simulator") -> Twin | None:
     if sim.touches:
         used["contact_tolerance"] = given.contact_tolerance or CONTACT_TOLERANCE[precision]
     tight = {name: TIGHTER * value for name, value in used.items()}
-    return Twin(f"tolerances x {TIGHTER:g}", sim._copy(**tight), TIGHTER) if tight else None
+    return Twin(f"tolerances x {TIGHTER:g}", sim._copy(**tight, budget=None), TIGHTER) if tight else None
 
 
 def on_mesh(sim: "Simulator", mesh: str | Scene) -> tuple[Twin, list[float | None]]:
@@ -96,7 +96,7 @@ def on_mesh(sim: "Simulator", mesh: str | Scene) -> tuple[Twin, list[float | Non
     if sim.settings.explicit:
         limit = STABLE_FRACTION * stable_dt(scene, sim.settings.integrator == "velocity_verlet")
         steps = max(1, math.ceil(dt / limit))
-    other = type(sim)(scene, **settings | {"dt": dt / steps})
+    other = type(sim)(scene, **settings | {"dt": dt / steps, "budget": None})
     try:
         nodes = shared_nodes(*_nodes(sim), *_nodes(other))
         shift = _placement(other)[nodes[1]] - _placement(sim)[nodes[0]]

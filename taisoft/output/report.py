@@ -81,12 +81,13 @@ def body_records(scene) -> list[dict]:
 def extremes(reports: list[StepReport]) -> dict:
     """Return, per numeric field of StepReport, min and max of the finite values, their times [s], and the count of other values.
 
-    `not_converged` counts reports; without reports the dict is empty.
+    `not_converged` and `ended_on_budget` count reports; without reports the dict is empty.
     """
     if not reports:
         return {}
     times = np.array([r.time for r in reports])
     found: dict = {"reports": len(reports), "not_converged": sum(not r.converged for r in reports)}
+    found["ended_on_budget"] = sum(r.on_budget for r in reports)
     table = {name: [getattr(r, name) for r in reports] for name in NUMERIC}
     table |= {heading: [r.details.get(heading, 0.0) for r in reports] for heading in headings(reports)}
     for name, given in table.items():

@@ -23,6 +23,7 @@ KEYS = (
     Key((ti.ui.UP,), "Up arrow", "faster", "faster", "run twice as fast, up to 16 times real time"),
     Key((ti.ui.DOWN,), "Down arrow", "slower", "slower", "run half as fast"),
     Key(("x",), "X", "unbound", "as fast as possible", "run as fast as the solver can, or bound to the clock again"),
+    Key(("b",), "B", "budget", "budget", "end steps on a budget of wall time, or solve them"),
     Key(("h",), "H", "frame", "frame the bodies", "frame the bodies"),
     Key(("l",), "L", "follow", "follow them", "the camera follows the bodies, or stays"),
     Key(("v",), "V", "colour", "colours", "colour bodies by stress, stretch, speed, pressure, slip or body"),

@@ -4,6 +4,10 @@ The simulated time is due at speed times the wall time since an anchor. Steps ar
 simulation that falls behind drops what it cannot make up: the anchor moves, so that it never runs faster than asked afterwards.
 Between two steps, or batches of explicit ones no longer than a picture, the commands of the window are carried out, and the state
 is sent if the window has taken the previous one. So the simulation never waits for the window, and the window never for a step.
+
+So that it keeps up, an implicit step gets a budget of wall time (`Simulator.budget`): SHARE of the dt / speed in which
+it is due, less what a state sent after it takes, but at least LEAST_SHARE. The first step has none, nor have single steps, those
+as fast as possible and those after the user has switched it off; one that the simulator has of its own counts instead.
 """
 
 import math
@@ -21,6 +25,7 @@ from taisoft.view.timing import Note
 BATCH = 1.0 / 60.0  # longest wall time of a batch of explicit steps [s]
 ARREARS = 0.05  # of simulated time at unit speed that a simulation makes up [s]
 SPEED_WINDOW = 0.5  # wall time over which speeds are measured [s]
+SHARE, LEAST_SHARE = 0.8, 0.2  # see above
 SLOW = 1.1  # wall time over simulated time above which the solver counts as too slow
 MAX_SPEED = 16.0
 PATIENCE = 1.0  # longest wait for the window before what takes long [s]
@@ -32,26 +37,31 @@ class LiveRun:
     """Drives sim by the clock and by the window's commands.
 
     window: a `WindowProcess`, or what has its `receive`, `publish` and `closed`; speed: simulated over wall time, infinite for as
-    fast as possible. note: about the start; problem: why the run paused, a sentence or empty.
+    fast as possible. note: about the start; budget: whether implicit steps get one, see above; problem: why the run paused, a
+    sentence or empty.
     """
 
-    def __init__(self, sim, window, paused: bool = False, speed: float = 1.0, note: str = ""):
+    def __init__(self, sim, window, paused: bool = False, speed: float = 1.0, note: str = "", budget: bool = True):
         self.sim, self.paused, self.speed = sim, paused, speed
         self.problem, self._note = "", Note(note)
         self._window, self._controls = window, Controls(sim)
+        self._own_budget, self._is_budgeted, self._sending = sim.settings.budget, budget, 0.0  # the last: a state [s]
         self._last_speed = 1.0  # before it was unbound
         self._compiled = False  # True after a step, since that compiles everything
         self._published = -math.inf  # wall time of the last published state
         self._changed = True  # since that
         self._drag_request = self._drag_done = 0  # of the last drag: its number, and the last one that a step has used
-        self._measured = {"speed": 0.0, "steps_per_second": 0.0, "cost": 0.0}
+        self._measured = {"speed": 0.0, "steps_per_second": 0.0, "cost": 0.0, "on_budget": ""}
         self._start_measuring()
 
     def run(self) -> None:
         """Run until the window is closed."""
-        with self._noted_warnings():
-            while not self._window.closed:
-                self.turn()
+        try:
+            with self._noted_warnings():
+                while not self._window.closed:
+                    self.turn()
+        finally:
+            self.sim.budget = self._own_budget
 
     def turn(self) -> None:
         """Wait until a step is due or a command comes; carry out commands, take the steps, and publish the state."""
@@ -93,7 +103,16 @@ class LiveRun:
         if behind > max(ARREARS * self.speed, 2.0 * dt):
             self._set_anchor(dt)
 
+    def _budget(self) -> float | None:
+        """Return the wall time of the next step [s], see above; None: any."""
+        is_due = self._compiled and not (self.paused or math.isinf(self.speed))
+        if not (self._is_budgeted and is_due and self.sim.settings.tolerance is None):
+            return None
+        due = self.sim.dt / self.speed
+        return max(LEAST_SHARE * due, SHARE * due - self._sending * min(1.0, due / BATCH))
+
     def _take(self, n: int) -> None:
+        self.sim.budget = self._budget() if self._own_budget is None else self._own_budget
         timed_advance(self.sim, n, self._after_step)
         if not self._compiled:
             self._compiled = True
@@ -105,12 +124,14 @@ class LiveRun:
         self._spent[0] += seconds
         self._spent[1] += report.steps * self.sim.dt
         self._measured["cost"] = self._measured["cost"] or seconds / (report.steps * self.sim.dt)
-        if report.problems:
+        self._residuals += [report.residual] if report.on_budget else []
+        if len(report.problems) > report.on_budget:  # besides the first one, which the status tells
             self._note.set(report.problems[-1])
 
     def _start_measuring(self) -> None:
         self._mark = (time.perf_counter(), self.sim.time, self.sim.step_count)
-        self._spent = [0.0, 0.0]  # wall and simulated time of the steps since the mark [s]
+        self._spent = [0.0, 0.0]  # wall and simulated time of the steps since the mark [s],
+        self._residuals: list[float] = []  # and the residuals of those that ended on budget
         self._set_anchor()
 
     def _measure(self) -> None:
@@ -123,7 +144,9 @@ class LiveRun:
         found["steps_per_second"] = (self.sim.step_count - self._mark[2]) / elapsed
         if self._spent[1] > 0.0:
             found["cost"] = self._spent[0] / self._spent[1]
-        self._mark, self._spent = (now, self.sim.time, self.sim.step_count), [0.0, 0.0]
+        n, cut = self.sim.step_count - self._mark[2], self._residuals
+        found["on_budget"] = f"on budget: {len(cut)} of {n} steps, residual {max(cut):.1g}" if cut else ""
+        self._mark, self._spent, self._residuals = (now, self.sim.time, self.sim.step_count), [0.0, 0.0], []
 
     # --- commands -----------------------------------------------------------------------------------------------------
 
@@ -161,6 +184,11 @@ class LiveRun:
 
     def _on_unbound(self) -> None:
         self._set_speed(self._last_speed if math.isinf(self.speed) else math.inf)
+
+    def _on_budget(self) -> None:
+        if self._own_budget is None:
+            self._is_budgeted = not self._is_budgeted
+        self._own_budget = None
 
     def _set_speed(self, speed: float) -> None:
         if not math.isinf(self.speed):
@@ -219,8 +247,10 @@ class LiveRun:
         due = age > REPEAT or (self._changed and not awaited)
         if not due or not (self._window.ready or patience):
             return
+        begin = time.perf_counter()
         self._window.publish(self.sim, self.panel_state(), patience)
         self._published, self._changed = time.perf_counter(), False
+        self._sending = 0.0 if patience else self._published - begin  # without waiting for the window
 
     def panel_state(self) -> dict:
         """Return what the panel shows besides the state."""
@@ -229,6 +259,7 @@ class LiveRun:
             "paused": self.paused,
             "asked_speed": None if math.isinf(self.speed) else self.speed,
             "status": self._status(),
+            "budget": self._is_budgeted if self._own_budget is None else True,
             "messages": [*([self.problem] if self.problem else []), *self._note.shown],
             "drag_done": self._drag_done,
             **self._measured,

@@ -9,7 +9,7 @@ import math
 import textwrap
 from collections.abc import Callable
 
-from taisoft.dynamics.schemes import CHOICES
+from taisoft.dynamics.schemes import CHOICES, SCHEMES, STATIC
 from taisoft.settings import contact_solvers
 from taisoft.view.colouring import TITLES, Colouring, following
 from taisoft.view.keys import KEYS
@@ -87,6 +87,8 @@ class Panel:
         names = {"pause": "run" if state["paused"] else "pause", "step": "step", "reset": "restart", "unbound": "real time"}
         if state["asked_speed"] is not None:
             names["unbound"] = "as fast as possible"
+        if values["integrator"] in SCHEMES and values["integrator"] != STATIC:
+            names["budget"] = "solve steps to the end" if state["budget"] else "keep up with the clock"
         for action, text in names.items():
             if gui.button(f"{text}###{action}"):
                 self.pressed.add(action)

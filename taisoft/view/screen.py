@@ -32,7 +32,7 @@ ZOOM = 16.0  # factor on the distance for a drag over the whole window
 DRAG_COLOUR = np.array([0.85, 0.10, 0.35])  # sRGB
 LONG = 1.0  # wall time of a step after which the panel says so [s]
 OUT = Path("out")
-FOR_SIMULATION = {"pause", "step", "reset", "faster", "slower", "unbound"}  # actions that the simulation carries out
+FOR_SIMULATION = {"pause", "step", "reset", "faster", "slower", "unbound", "budget"}  # actions of the simulation
 
 
 class Screen(SceneView):

@@ -84,4 +84,5 @@ class Timing:
         if "speed" not in state:
             return [pictures]
         asked = "" if state["asked_speed"] in (1.0, None) else f" (asked: {state['asked_speed']:g})"
-        return [f"speed    {state['speed']:10.2f} x real time{asked}, {state['steps_per_second']:.3g} steps/s", pictures]
+        speed = f"speed    {state['speed']:10.2f} x real time{asked}, {state['steps_per_second']:.3g} steps/s"
+        return [speed, f"solver   {state['on_budget'] or 'within its time'}", pictures]

@@ -181,14 +181,16 @@ def show(
     colour: str = "body",
     layers: tuple[str, ...] = IN_WINDOW,
     speed: float = 1.0,
+    budget: bool = True,
 ) -> None:
     """Run a simulation in a window until it is closed, following the clock.
 
     sim: an open Simulator; if made with draggable=True, its bodies can be dragged with the mouse. fps: dt is lowered to a divisor
-    of 1/fps as by `run`, so that without a drag the states are those of `run`, bit by bit; None keeps dt. speed: simulated over
-    wall time, `math.inf` for as fast as possible. A failed step pauses the run and the reason is shown; R restarts. colour,
-    layers: initial ones. Raises OutputError, before anything is opened, if a display or a Vulkan driver is missing, and if the
-    window's process is lost.
+    of 1/fps as by `run`; None keeps dt. speed: simulated over wall time, `math.inf` for as fast as possible. budget: end implicit
+    steps before they are solved where they would fall behind the clock (`Simulator.budget`); a simulator's own budget counts
+    instead. If no step ends so, and without a drag, the states are those of `run`, bit by bit. A failed step pauses the run and
+    the reason is shown; R restarts. colour, layers: initial ones. Raises OutputError, before anything is opened, if a display or
+    a Vulkan driver is missing, and if the window's process is lost.
     """
     if fps is not None and not fps > 0:
         raise OutputError(f"the window's fps is {fps}; it must be positive")
@@ -198,7 +200,7 @@ def show(
     window = WindowProcess(sim, controls=True, colour=colour, layers=layers)
     try:
         fit_dt(sim, fps, report)
-        LiveRun(sim, window, paused, speed, dt_sentence(report)).run()
+        LiveRun(sim, window, paused, speed, dt_sentence(report), budget).run()
     finally:
         window.close()
         if sim.dragged is not None:

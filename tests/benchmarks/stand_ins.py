@@ -83,3 +83,4 @@ def ipc_record(job=None, **more) -> ipc_runs.Record:
 
 WINDOW = {"demo": "cube_on_box", "tets": 1215, "dt": 0.01, "step": 0.002, "longest_step": 0.02, "alone": 3.0, "speed": 1.0}
 WINDOW |= {"intervals": [0.04, 0.04, 0.07], "latencies": [0.05, 0.06, 0.09]}
+WINDOW |= {"budget": {"speed": 0.99, "step": 2e-3, "longest_step": 8e-3, "ended": 0.25, "residual": 0.03, "latencies": [0.07]}}

@@ -307,7 +307,11 @@ RUNS = {
         ("--sizes", "20", "--kind", "explicit"), ("| explicit | 20 | 1 |", "no earlier run"), scaling_small, scaling_check
     ),
     "tolerance": Small((*BEAM, "--wish", "1"), ("| hanging beam | 1 | bdf2 | 8 |",), tolerance_small, tolerance_check),
-    "window": Small(QUICK, ("| cube_on_box | 1,215 | 10 | 2 | 20 | 3.00 | 1.00 | 25 | 70 | 60 | 87 |",), window_small),
+    "window": Small(
+        QUICK,
+        ("| cube_on_box | 1,215 | 10 | 2 | 20 | 3.00 | 1.00 | 25 | 70 | 60 | 87 | 0.99 | 4.0 | 25 | 0.03 | 70 |",),
+        window_small,
+    ),
 }
 WHOLE = {"startup": Small(QUICK)} | {name: Small(run.arguments) for name, run in RUNS.items() if name != "window"}  # a display
 

@@ -22,6 +22,7 @@ BAD = [
     ('material = "rubber"', "material = {}\nmaterials = {}", "bodies.beam must have either a material or materials"),
     ("dt = 0.01", "dtt = 1", "solver.dtt is not known (did you mean dt?); there are dt, integrator"),
     ("dt = 0.01", 'arch = "gpu"', "solver.arch must be one of cpu, cuda, not 'gpu'"),
+    ("dt = 0.01", "budget = true", "solver.budget must be a number, not True"),
     ("dt = 0.01", "quantities = { q = 3 }", "solver.quantities must be texts or functions by name, not 3"),
     ("1e-4", "0", "solver.newton_tolerance must be greater than 0"),
     ("[0, -9.81, 0]", f"[0, {10**30}, 0]", "gravity[1] is a whole number of more than 64 bits"),

@@ -28,6 +28,8 @@ def test_bad_settings_are_refused():
         ({"arch": "gpu"}, "arch must be one of cpu, cuda, not 'gpu'"),
         ({"newton_tolerance": 0.5}, "newton_tolerance must be below 0.1"),
         ({"tolerance": 1.0}, "tolerance must be below 1"),
+        ({"budget": -1e-3}, "budget must be at least 0 s"),
+        ({"budget": 0.01, "tolerance": 0.01}, "a budget ends steps at any error, and a tolerance bounds the error"),
         ({"allow_unstable": 1}, "allow_unstable must be True or False"),
         ({"contact_solver": "gauss_siedel"}, "contact_solver must be one of .*, not 'gauss_siedel'; did you mean 'gauss_seidel'"),
         ({"contact_solver": "gauss_seidel"}, "'gauss_seidel' does not fit implicit_euler: use 'auto' or augmented_lagrangian$"),
@@ -55,6 +57,23 @@ def test_defaults_are_those_of_the_simulators_signature():
     assert list(parameters) == ["scene", *NAMES] and type(check_dt(1)) is float
     with ts.Simulator(block_scene(), newton_tolerance=np.float32(1e-3), precision="f64") as sim:
         assert type(sim.settings.newton_tolerance) is float
+
+
+def test_a_budget_is_assigned_and_kept(tmp_path):
+    with ts.Simulator(block_scene(), precision="f64", budget=np.float32(0.5)) as sim:
+        assert sim.budget == 0.5 and type(sim.budget) is float
+        sim.budget = 2
+        with pytest.raises(ts.SimulationError, match="budget must be at least 0 s, not -1"):
+            sim.budget = -1
+        sim.rebuild(newton_tolerance=1e-6)
+        assert sim.budget == sim.settings.budget == 2.0
+        sim.save_checkpoint(tmp_path / "checkpoint.npz")
+        with pytest.raises(ts.SimulationError, match="take one of them"):
+            sim.rebuild(tolerance=0.01)
+        sim.budget = None
+        assert sim.settings.budget is None
+    with ts.Simulator.load_checkpoint(tmp_path / "checkpoint.npz", block_scene()) as sim:
+        assert sim.budget == 2.0
 
 
 def test_an_overlap_at_the_start_is_refused_and_leaves_nothing_open(monkeypatch):

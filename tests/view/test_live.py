@@ -136,6 +136,48 @@ def test_as_fast_as_possible_and_the_keys_of_speed(live):
     assert window.states[-1]["asked_speed"] is None
 
 
+def test_an_implicit_step_gets_a_budget_of_the_time_in_which_it_is_due(live):
+    sim = Clock(0.01, 1e-3, "implicit_euler")
+    run, window = live(sim, {10: [["slower"]], 20: [["faster"]], 30: [["budget"]], 40: [["budget"]], 50: [["unbound"]]})
+    budgets, publish, advance = {}, window.publish, sim.advance
+
+    def slow_publish(*arguments):
+        sim.now += 1e-3
+        publish(*arguments)
+
+    def on_budget(n):
+        budgets[sim.step_count], report = sim.budget, advance(n)
+        if sim.step_count % 2:
+            report.on_budget, report.residual, report.problems = 1, 0.02, ["step 1: on budget: Newton stopped"]
+        return report
+
+    window.publish, sim.advance, window.steps = slow_publish, on_budget, 60
+    run.run()
+    assert budgets[5] == pytest.approx(0.8 * 0.01 - 0.6 * 1e-3), (
+        "four fifths of dt, less a state's time for dt of a 60th of a second"
+    )
+    assert budgets[15] == pytest.approx(0.8 * 0.02 - 1e-3) and budgets[25] == budgets[45] == pytest.approx(budgets[5])
+    assert budgets[35] is None and budgets[55] is None and sim.budget is None
+    assert [state["budget"] for state in window.states if state["step_count"] == 35] == [False]
+    found = {state["on_budget"] for state in window.states}
+    assert any(text.startswith("on budget: ") and text.endswith(" steps, residual 0.02") for text in found)
+    assert not any(state["messages"] for state in window.states), "the panel says so"
+    sim = Clock(0.01, 1e-3, "implicit_euler")
+    run, _ = live(sim, {0: [["step"]]}, paused=True)
+    run.turn()
+    assert sim.budget is None, "single steps are solved to their end"
+    own = Clock(0.01, 1e-3, "implicit_euler")
+    own.settings = Settings(budget=0.5)
+    run, _ = live(own)
+    own.now += 0.02
+    run.turn()
+    assert own.budget == 0.5 and run.panel_state()["budget"]
+    run, _ = live(Clock(0.01, 1e-3, "implicit_euler"), budget=False)
+    run.sim.now += 0.02
+    run.turn()
+    assert run.sim.budget is None and not run.panel_state()["budget"]
+
+
 def test_commands_are_carried_out_between_steps(live):
     sim = Clock(integrator="implicit_euler")
     begin = ["begin_drag", "beam", np.array([1, 2]), np.array([0.5, 0.5])]

@@ -141,6 +141,10 @@ def test_every_pair_shows_its_friction_and_buttons_choose_a_solver(draw, cubes):
     assert cubes.scene.contact_numbers("a", "ground")[0] == 0.8
     draw(presses=("pause", "step"), checks=["solver"])
     assert draw.panel.pressed == {"pause", "step"} and draw.panel.strength == 10.0
+    state = state_of(draw.controls) | {"budget": True}
+    for integrator, pressed in (("symplectic_euler", set()), ("implicit_euler", {"budget"}), ("static", set())):
+        draw(presses=("budget",), state=state | {"controls": state["controls"] | {"integrator": integrator}})
+        assert draw.panel.pressed == pressed, "budgets are of implicit steps in time"
     draw(presses=("integrator",))
     assert draw(presses=("use",))[1] == [["rebuild", "velocity_verlet", "auto"]] and draw.panel.pressed == set()
 
@@ -192,7 +196,10 @@ def test_latency_counts_from_the_last_look_that_saw_nothing(monkeypatch):
         timing.polled()
     assert list(timing.latencies) == [pytest.approx(0.02 * (8 - 4))]
     assert timing.seconds_to_answer(1.0) == pytest.approx(0.9), "the state has not come"
-    speed, pictures = timing.lines({"speed": 0.5, "asked_speed": 2.0, "steps_per_second": 30.0})
+    measured = {"speed": 0.5, "asked_speed": 2.0, "steps_per_second": 30.0}
+    speed, solver, pictures = timing.lines(measured | {"on_budget": "on budget: 3 of 9 steps, residual 0.02"})
+    assert solver == "solver   on budget: 3 of 9 steps, residual 0.02"
+    assert timing.lines(measured | {"on_budget": ""})[1] == "solver   within its time"
     assert speed.split() == "speed 0.50 x real time (asked: 2), 30 steps/s".split()
     assert pictures.split() == "view 50 pictures/s, drag after 80 ms".split() and timing.lines({}) == [pictures]
 
@@ -247,7 +254,7 @@ def test_keys(screen, tmp_path, cubes):
     screen, canvas, act = screen
     for key, action in {ti.ui.SPACE: "pause", "s": "step", ti.ui.RIGHT: "step", "r": "reset", ti.ui.UP: "faster"}.items():
         assert act([key]) == [[action]]
-    assert act([ti.ui.DOWN, "x", "?"]) == [["slower"], ["unbound"]]
+    assert act([ti.ui.DOWN, "x", "?", "b"]) == [["budget"], ["slower"], ["unbound"]]
     before = dict(screen.layers.shown)
     act("wcfd")
     assert {k for k in before if screen.layers.shown[k] != before[k]} == {"contacts", "fixed_nodes", "shadows", "wires"}

@@ -134,7 +134,7 @@ with PrintingSimulator(scene, dt=8e-3, integrator="symplectic_euler", draggable=
     show(sim, fps=None)
 print("closed")
 """
-YOUNG = (262, 308)  # pixel of a stiffer beam on the slider
+YOUNG = (262, 325)  # pixel of a stiffer beam on the slider
 RIGHT = 430  # of the panel
 TIP = (1120, 390)  # initial pixel of the beam's end
 
