@@ -2,7 +2,7 @@
 
 On a CPU one thread is faster: it takes 0.06 us per contact and sweep. A parallel loop costs some 30 us to start, a sweep has two
 to twenty of them, and memory bandwidth limits two threads to little more than the speed of one.
-On one thread Gauss-Seidel leaves out, until the next residual check, the contacts that a check finds open.
+On one thread Gauss-Seidel leaves out, until the next residual check, the contacts that a check after the first finds open.
 
 Nesterov momentum follows any kind of sweep. The next one starts from the extrapolated impulses
     y = prox(x + (t - 1)/t' (x - x_before)),   t' = (1 + sqrt(1 + 4 t^2)) / 2,
@@ -144,7 +144,7 @@ def _check(problem: ti.template(), chunks: ti.template(), first, sweeps):
     """Check the residual and save or restore the impulses; w must be up to date."""
     for c in range(problem.count[0]):
         problem.sweep.term[c] = natural_map(problem, c)
-        problem.sweep.idle[c] = int((problem.sweep.term[c] == 0.0).all())
+        problem.sweep.idle[c] = int(first == 0 and (problem.sweep.term[c] == 0.0).all())
     _sum_chunks(problem, chunks)
     ti.loop_config(serialize=True)
     for _ in range(1):

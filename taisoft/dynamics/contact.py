@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import taichi as ti
 
-from taisoft.backend.arrays import FieldArena
+from taisoft.backend.arrays import FieldArena, upload
 from taisoft.collision.contacts import Contacts
 from taisoft.collision.detector import Detection
 from taisoft.collision.intersections import CROSSED
@@ -300,8 +300,9 @@ class ContactStep:
             return False
         entries = most_entries(self.simulation.model, needed - self.n_contacts, self.detection.end.buffer.n_listed)
         if room := self._room(needed, int(self.problem.count[2]) + entries):
-            last_time, rows = self._last_time, read_rows(self.problem, MORE_ROWS)
+            last_time, rows, mass = self._last_time, read_rows(self.problem, MORE_ROWS), self.problem.inverse_mass.to_numpy()
             self._allocate(*room)
+            upload([(self.problem.inverse_mass, mass)])
             write_rows(self.problem, rows)
             index_nodes(self.problem)
             self._last_time, self._indexed = last_time, True

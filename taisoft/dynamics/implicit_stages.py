@@ -112,7 +112,7 @@ class ImplicitStages:
         if self.scheme.c == 0.0 and self._multipliers is not None and self.simulation.time == 0.0:
             self.simulation.set_multipliers(self._multipliers.static_start())
         self.contact.forget()
-        self.solver.linear_solver.forget()
+        self.solver.forget()
 
     def numbers_changed(self) -> None:
         """Update for changed gravity or material numbers."""

@@ -163,6 +163,11 @@ class StageSystem:
         self.linear_solver.restore(kept["linear_solver"])
         self.n_direct = int(kept["direct"])
 
+    def forget(self) -> None:
+        """Discard what was learned of the choice of solvers, after the state was set."""
+        self.linear_solver.forget()
+        self.n_direct = 0
+
     def numbers_changed(self) -> None:
         """Update for changed gravity or material numbers."""
         self.rounding.measure()
@@ -305,15 +310,14 @@ class StageSystem:
         before = self.contacts
         if not changed and self.step_contacts.problem is before.problem:
             return False
+        base = before.coupling.base.to_numpy()
         self.begin_contacts()
         if self.contacts is not before:  # the storage has grown: set the displacements there, and the diagonal
+            upload([(self.contacts.coupling.base, base)])
             move(self.model, self.work, self.contacts, self.kind, STAY, 1.0, self.stage.c, self.stage.beta)
-            self.form_matrix()
-        else:
-            self._same_matrix = False  # its rows are, but not those of the contacts' terms
-            self.linear_solver.matrix_changed()
-            if self._direct is not None:
-                self._direct.contacts_changed()
+        self._same_matrix = False  # its rows are, but not those of the contacts' terms
+        if self._direct is not None:
+            self._direct.contacts_changed()
         self.find_factors()
         return True
 
