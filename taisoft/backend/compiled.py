@@ -51,6 +51,7 @@ class Compiled:
         inside = [name for k, name in enumerate(self._names) if k not in self._hosts]
         self._kernel = Kernel(generate(function, dict.fromkeys(inside), declare), AutodiffMode.NONE)
         key = self._kernel.ensure_compiled(*hosts)
+        self._is_queued = on_cuda()  # whether launches return before they end
         # methods of a context that read a value
         reads = {ti.f64: "get_struct_ret_float", ti.i32: "get_struct_ret_int"}
         self._returned = [reads[kind] for kind in self._kernel.return_type or ()]
@@ -96,7 +97,7 @@ class Compiled:
         """What the kernel returned, None if it returns nothing."""
         if not self._returned:
             return None
-        if on_cuda():
+        if self._is_queued:
             ti.sync()
         values = [getattr(context, read)((k,)) for k, read in enumerate(self._returned)]
         return values[0] if len(values) == 1 else values
