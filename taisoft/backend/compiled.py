@@ -10,7 +10,7 @@ from typing import Any, NamedTuple, get_args
 
 import taichi as ti
 
-from taisoft.backend.arrays import Array
+from taisoft.backend.arrays import Array, on_cuda
 from taisoft.backend.pack import CODES, Arguments
 from taisoft.backend.private import AutodiffMode, Kernel, impl, ndarray_type, primitive_types
 from taisoft.backend.structure import COUNT, generate, leaf_structures, leaves_of, rebuild
@@ -51,6 +51,10 @@ class Compiled:
         inside = [name for k, name in enumerate(self._names) if k not in self._hosts]
         self._kernel = Kernel(generate(function, dict.fromkeys(inside), declare), AutodiffMode.NONE)
         key = self._kernel.ensure_compiled(*hosts)
+        self._is_queued = on_cuda()  # whether launches return before they end
+        # methods of a context that read a value
+        reads = {ti.f64: "get_struct_ret_float", ti.i32: "get_struct_ret_int"}
+        self._returned = [reads[kind] for kind in self._kernel.return_type or ()]
         self._cpp, program = self._kernel.compiled_kernels[key], impl.get_runtime().prog
         self.program, self.data = program, program.compile_kernel(program.config(), program.get_device_caps(), self._cpp)
 
@@ -91,10 +95,11 @@ class Compiled:
 
     def result(self, context: Any) -> Any:
         """What the kernel returned, None if it returns nothing."""
-        if (kinds := self._kernel.return_type) is None:
+        if not self._returned:
             return None
-        ti.sync()
-        values = [self._kernel.construct_kernel_ret(context, kind, (i,)) for i, kind in enumerate(kinds)]
+        if self._is_queued:
+            ti.sync()
+        values = [getattr(context, read)((k,)) for k, read in enumerate(self._returned)]
         return values[0] if len(values) == 1 else values
 
 

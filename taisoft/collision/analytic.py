@@ -192,7 +192,7 @@ def _obstacle_contacts(s: ti.template(), o: ti.template(), t, k, margin, out: ti
     reach = ti.max((A - centre).norm(), (B - centre).norm(), (C - centre).norm())
     motion = ti.max(a.norm(), b.norm(), c.norm())
     kind = o.kind[k]
-    middle, _ = o.sample(k, centre)
+    middle, slope = o.sample(k, centre)
     if middle - reach - motion <= margin:
         phi = dvec(0.0)
         has_deepest = ti.static(o.kinds != (HALF_SPACE,))
@@ -203,9 +203,13 @@ def _obstacle_contacts(s: ti.template(), o: ti.template(), t, k, margin, out: ti
                 accepted = (s.owns[t] >> j) & 1
             elif ti.static(has_deepest):
                 if kind != HALF_SPACE:
-                    v, value = deepest_point(o, k, A, B, C, phi)
-                    w = 1.0 * v
-                    accepted = int(value < phi.min() - ti.cast(MIN_EXTRA_DEPTH, ti.f64) * reach and w.max() < 1.0 - 1e-6)
+                    limit = phi.min() - ti.cast(MIN_EXTRA_DEPTH, ti.f64) * reach
+                    # phi is convex, so that it lies above its tangent at the centre
+                    lowest = middle + ti.min((A - centre).dot(slope), (B - centre).dot(slope), (C - centre).dot(slope))
+                    if lowest < limit and lowest - motion <= margin:
+                        v, value = deepest_point(o, k, A, B, C, phi)
+                        w = 1.0 * v
+                        accepted = int(value < limit and w.max() < 1.0 - 1e-6)
             p, move = w[0] * A + w[1] * B + w[2] * C, w[0] * a + w[1] * b + w[2] * c
             value, g = o.sample(k, p)
             for i in ti.static(range(3)):

@@ -217,6 +217,8 @@ def sides_of(found: ContactFields, at: np.ndarray) -> tuple[np.ndarray, np.ndarr
     """Vertices and weights (k, 2 w) of contacts at places (k,), see `in_columns`."""
     vertex, weight = (np.hstack([getattr(found, f"{name}_{side}")[at] for side in "ab"]) for name in ("nodes", "weights"))
     mortar = np.flatnonzero(found.feature[at][:, 0] == MORTAR) if len(at) else at
+    if len(mortar) == 0:  # in columns already
+        return vertex, np.where(vertex >= 0, weight, 0.0)
     vertex[mortar] = -1
     contact, column = np.nonzero(vertex >= 0)
     rows = [contact, column >= 3, vertex[contact, column], weight[contact, column]]

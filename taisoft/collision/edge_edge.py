@@ -218,9 +218,30 @@ def edge_contact(s: ti.template(), t, k, u, m, margin, out: ti.template(), start
 
 
 @ti.func
-def can_cross(a, b):
-    """1 if two edges can cross: one is sharp, the other sharp or flat. a, b: bits of `mark_sharp_edges`, shifted to the edge."""
-    return ((a & (b >> 3)) | ((a >> 3) & b)) & 1
+def crossable(a, b):
+    """Which edges of a triangle can cross an edge, in bits 0-2: one is sharp, the other sharp or flat. a, b: bits of
+    `mark_sharp_edges`, those of the edge in bits 0 and 3."""
+    return ti.select(a & 1, b >> 3, 0) & 7 | ti.select(a & 8, b, 0) & 7
+
+
+@ti.func
+def may_cross(s: ti.template(), t, k, u, m):
+    """Whether the lines of two edges, neither nearly parallel, are nearest between their ends or slightly beyond, at the start or
+    at the end of the step: what `edge_contact` needs, without roots and quotients."""
+    least, slack = ti.cast(0.9 * CROSSING**2, ti.f64), ti.cast(MAX_OVERHANG + 1e-3, ti.f64)
+    p, q, w = corner(s, t, k + 1) - corner(s, t, k), corner(s, u, m + 1) - corner(s, u, m), corner(s, u, m) - corner(s, t, k)
+    found = False
+    for at_end in range(2):
+        if at_end == 1:
+            p += _move(s, t, k, 1.0) - _move(s, t, k, 0.0)
+            q += _move(s, u, m, 1.0) - _move(s, u, m, 0.0)
+            w += _move(s, u, m, 0.0) - _move(s, t, k, 0.0)
+        pp, pq, qq, pw, qw = p.dot(p), p.dot(q), q.dot(q), p.dot(w), q.dot(w)
+        square = pp * qq - pq * pq
+        f, g = qq * pw - pq * qw, pq * pw - pp * qw  # times the square
+        inner = ti.min(f, square - f, g, square - g) >= -slack * square
+        found = found or (inner and square > least * pp * qq)
+    return found
 
 
 class Vertices(Visitor):
@@ -264,13 +285,16 @@ class Edges(Visitor):
     def visit(self, surface: ti.template(), t, q, entry: ti.template(), first, last, out: ti.template(), start, end):
         """See Visitor."""
         at = start
-        for e in range(9 * (last - first)):
-            u, k_t, k_u = entry[first + e // 9], e % 9 // 3, e % 3
-            if can_cross(surface.sharp[t] >> k_t, surface.sharp[u] >> k_u) == 1:
-                t1, k1, t2, k2 = t, k_t, u, k_u
-                if u < t:
-                    t1, k1, t2, k2 = u, k_u, t, k_t
-                at = edge_contact(surface, t1, k1, t2, k2, surface.margin[0], out, at, end)
+        for e in range(3 * (last - first)):
+            u, k = entry[first + e // 3], e % 3
+            edges = crossable(surface.sharp[t] >> k, surface.sharp[u])
+            for m in range(ti.select(edges != 0, 3, 0)):
+                if (edges >> m) & 1:
+                    if may_cross(surface, t, k, u, m):
+                        t1, k1, t2, k2 = t, k, u, m
+                        if u < t:
+                            t1, k1, t2, k2 = u, m, t, k
+                        at = edge_contact(surface, t1, k1, t2, k2, surface.margin[0], out, at, end)
         return at
 
 

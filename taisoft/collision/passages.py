@@ -51,6 +51,28 @@ def _axis_end(o: ti.template(), k, side, time):
 
 
 @ti.func
+def _box_round(o: ti.template(), k, span, floor):
+    """Box around sphere or capsule k and what is nearer to it than `floor` [m], at any time of the step."""
+    a, b, c, d = (
+        _axis_end(o, k, -1, span[0]),
+        _axis_end(o, k, 1, span[0]),
+        _axis_end(o, k, -1, span[1]),
+        _axis_end(o, k, 1, span[1]),
+    )
+    grown = floor + _radius(o, ROUND, k)
+    return ti.min(a, b, c, d) - grown, ti.max(a, b, c, d) + grown
+
+
+@ti.func
+def _is_in_box(s: ti.template(), g: ti.template(), t, lo, hi):
+    """Whether the box around the path of triangle t meets another one."""
+    i, j, k = s.triangle[t, 0], s.triangle[t, 1], s.triangle[t, 2]
+    a, b, c = s.x[i], s.x[j], s.x[k]
+    a1, b1, c1 = a + g.path[i], b + g.path[j], c + g.path[k]
+    return (ti.min(a, b, c, a1, b1, c1) <= hi).all() and (ti.max(a, b, c, a1, b1, c1) >= lo).all()
+
+
+@ti.func
 def _radius(o: ti.template(), kind, b):
     """Radius [m] of the round shape b, 0 for other kinds of pairs."""
     radius = ti.cast(0.0, ti.f64)
@@ -176,12 +198,14 @@ def _write_triangle_passages(
     last,
 ):
     """Write the passages of chunk c through triangles, spheres and capsules. Return the new count."""
-    at, n_near, n_adjacent, n_round = start, 0, 0, 0
+    at, n_near, n_adjacent, n_round, n_triangles, last_round = start, 0, 0, 0, 0, -1
+    lo, hi = dvec(0.0), dvec(0.0)
     if ti.static(g.has_pairs):
         n_near = list_unseparated(s, g, near, c)
         n_adjacent = part_first(c + 1, g.n_adjacent, s.chunks) - part_first(c, g.n_adjacent, s.chunks)
     if ti.static(o.has_round):
-        n_round = o.count * (part_first(c + 1, s.n_triangles, s.chunks) - part_first(c, s.n_triangles, s.chunks))
+        n_triangles = part_first(c + 1, s.n_triangles, s.chunks) - part_first(c, s.n_triangles, s.chunks)
+        n_round = o.count * n_triangles
     for e in range(n_near + n_adjacent + n_round):
         kind, a, b, checked, plane = NEAR, 0, 0, True, 0
         if e < n_near:
@@ -193,11 +217,14 @@ def _write_triangle_passages(
             kind, a = ADJACENT, part_first(c, g.n_adjacent, s.chunks) + e - n_near
             checked = g.exempt[_body_of(s, g.adjacent[a, 0]) * (s.n_bodies + 1)] == 0
         elif ti.static(o.has_round):
-            kind, a = ROUND, part_first(c, s.n_triangles, s.chunks) + (e - n_near - n_adjacent) // o.count
-            b = (e - n_near - n_adjacent) % o.count
+            kind, a = ROUND, part_first(c, s.n_triangles, s.chunks) + (e - n_near - n_adjacent) % n_triangles
+            b = (e - n_near - n_adjacent) // n_triangles
             checked = (o.kind[b] == SPHERE or o.kind[b] == CAPSULE) and s.soft[s.body[a]] == 1
             if checked:
-                checked = g.exempt[s.body[a] * s.n_bodies + o.body[b]] == 0
+                if b != last_round:
+                    last_round = b
+                    lo, hi = _box_round(o, b, span, floor)
+                checked = _is_in_box(s, g, a, lo, hi) and g.exempt[s.body[a] * s.n_bodies + o.body[b]] == 0
         radius = _radius(o, kind, b)
         if checked:
             found = _separating_plane(s, o, g, kind, a, b, span, floor + radius, plane)

@@ -108,6 +108,37 @@ def classify(s: ti.template(), i, u):
 
 
 @ti.func
+def may_have_contact(s: ti.template(), i, u, margin):
+    """Whether `vertex_contacts` may accept triangle u for vertex i: it is near on the outer side, or i may count as behind it.
+
+    This is known without a nearest point. margin [m]: as there.
+    """
+    a, b, c = corner(s, u, 0), corner(s, u, 1), corner(s, u, 2)
+    d, e, f = s.x[i] - a, b - a, c - a
+    h, n, own = d.dot(s.normal[u]), e.cross(f), s.body[u] == s.body[s.ring[s.ring_start[i]]]
+    nn, far = n.dot(n), 1.0 * margin
+    if h >= 0.0:  # no point of u closes faster than its fastest corner
+        for k in ti.static(range(3)):
+            far = ti.max(far, margin + (s.move[i] - s.move[s.triangle[u, k]]).norm())
+    else:  # within one body, only the foot of the perpendicular counts
+        far = ti.sqrt(4.0 * ti.cast(TINY, ti.f64) * s.area[u])
+    v, w = f.cross(-d).dot(n), e.cross(d).dot(n)
+    beyond = dvec(v + w - nn, -v, -w)  # heights over the edges' lines, times their lengths and the root of nn
+    lengths = dvec((f - e).dot(f - e), f.dot(f), e.dot(e))
+    far *= 1.0 + ti.cast(TINY, ti.f64)
+    is_far = ti.max(beyond, 0.0) ** 2 > far * far * nn * lengths
+    found = nn > 0.0 and not (h > far or is_far.any())
+    if h < 0.0 and not own:
+        found = True
+    elif h < 0.0 and found:
+        r, r1, r2 = s.rest[i] - s.rest[s.triangle[u, 0]], s.rest[s.triangle[u, 1]], s.rest[s.triangle[u, 2]]
+        r1, r2 = r1 - s.rest[s.triangle[u, 0]], r2 - s.rest[s.triangle[u, 0]]
+        # where i was as near behind u at rest, the body is only as thick as that
+        found = r.dot(r1.cross(r2)) >= 0.0 or (r - (v * r1 + w * r2) / nn).norm() > 0.99 * s.edge[s.body[u]]
+    return found
+
+
+@ti.func
 def _form_ridge(s: ti.template(), p, u, n_u, v, n_v, slack):
     """Whether triangles u and v form a ridge for p behind both: the projection of p onto each plane lies behind the other."""
     h_u, h_v = (p - corner(s, u, 0)).dot(n_u), (p - corner(s, v, 0)).dot(n_v)
@@ -137,7 +168,12 @@ def vertex_contacts(s: ti.template(), entry: ti.template(), first, last, i, own,
     # faces for the later passes; if there are too many, those passes use the whole row
     stored = ti.Vector.zero(ti.i32, MAX_STORED)
     n_stored = 0
-    phase, q, size = 0, 0, last - first
+    phase, q, size = 4, first, last - first
+    while q < last and phase == 4:
+        if may_have_contact(s, i, entry[q], margin):
+            phase = 0
+        q += 1
+    q = 0
     while phase <= 3:
         if q == size:  # later passes depend on the results of the first
             if phase == 0:

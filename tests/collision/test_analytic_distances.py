@@ -2,6 +2,7 @@
 
 * distances agree with other formulas in NumPy to a few roundings, from 1e-6 m to 1e150 m: inside, outside, on the surface and
   where gradients jump; gradients are unit vectors and agree with finite differences where the distance is smooth;
+* they are convex: none is below a tangent anywhere, whatever gradient is taken where several are possible;
 * no triangle that may have a contact in a step is skipped by the sphere around its box, whatever moves, and most others are;
 * weights of deepest points are convex, phi belongs to their point, no corner lies deeper, for needles and points too; the point
   is the deepest one of a dense sampling, to 1e-6 of the triangle's size.
@@ -107,6 +108,14 @@ def run():
 
     yield run
     arena.release()
+
+
+@pytest.mark.parametrize("name", SHAPES)
+def test_distances_are_convex(run, name):
+    rng = np.random.default_rng(6)
+    X = np.round(rng.uniform(-1.5, 1.5, (300, 3)), 1)  # some on axes and diagonal planes
+    phi, g = np.split(run(distances, name, X), (1,), axis=1)
+    assert (phi[:, 0] + ((X[:, None] - X) * g).sum(axis=2) <= phi + 1e-12).all()
 
 
 def reference_distance(shape, X: np.ndarray) -> np.ndarray:
