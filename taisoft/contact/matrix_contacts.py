@@ -1,14 +1,19 @@
 """Contact problems of a step as matrices: J, and the solution for a W assembled on the host, in fields that are kept."""
 
+import math
+from dataclasses import replace
+
 import numpy as np
 import scipy.sparse as sp
 
 from taisoft.backend.arrays import FieldArena, download
-from taisoft.contact import augmented_lagrangian
+from taisoft.contact import augmented_lagrangian, semismooth
 from taisoft.contact.colouring import colour_greedy, matrix_graph, store
 from taisoft.contact.problem import ContactProblem, build_matrix_problem, fill_field, fill_matrix_problem, read_entries
 from taisoft.contact.solve import SolveResult, solve
 
+DENSE, NEWTON = 900, 15  # most rows of a W for Newton's method, and its maximum iterations
+TIGHTER = 3  # solves, each to a smaller residual, until that with other r-factors is small enough
 OUTER = 30  # maximum iterations of the augmented Lagrangian
 
 
@@ -29,11 +34,14 @@ class MatrixContacts:
         tolerance: float,
         sweeps: int,
         outer: int = OUTER,
+        factor: np.ndarray | None = None,
+        limit: float = math.inf,
     ) -> tuple[np.ndarray, SolveResult]:
-        """Return impulses (k,3), from the start r (k,3), and the result; use an augmented Lagrangian if sweeps do not suffice.
+        """Return impulses (k,3), from the start r (k,3), and the result; by Newton's method where sweeps do not suffice, or else
+        by an augmented Lagrangian.
 
         W: (3k,3k); b: (3k,); friction: (k,); method, tolerance, sweeps: as in `contact.solve.solve`; outer: maximum iterations of
-        the augmented Lagrangian.
+        the augmented Lagrangian. factor, limit: other r-factors (k,2), and a bound on the residual with these.
         """
         W, k = sp.bsr_matrix(W, blocksize=(3, 3)), len(friction)
         p = self._problem
@@ -46,12 +54,30 @@ class MatrixContacts:
         fill_field(p.r, r)
         if method == "coloured_gauss_seidel":
             store(p, colour_greedy(matrix_graph(W)))
-        result = solve(p, method, tolerance, sweeps)
-        r = p.r.to_numpy(k)
-        if not result.converged:
-            r, history = augmented_lagrangian.solve(W.tocsr(), b, friction, r, tolerance, outer)
-            result = SolveResult(result.iterations + len(history) - 1, history[-1], history[-1] <= tolerance)
-        return r, result
+
+        def residual(r: np.ndarray, factor: np.ndarray | None = None) -> float:
+            return augmented_lagrangian.find_residual(W, b, friction, r, factor)
+
+        def holds(r: np.ndarray) -> bool:
+            return residual(r) <= tolerance and (factor is None or residual(r, factor) <= limit)
+
+        goal, iterations = tolerance, 0
+        for _ in range(1 if factor is None else TIGHTER):
+            result = solve(p, method, goal, sweeps)
+            r, iterations = p.r.to_numpy(k), iterations + result.iterations
+            if result.converged and holds(r):
+                return r, replace(result, iterations=iterations)
+            if 3 * k <= DENSE:
+                if found := semismooth.solve(W.toarray(), b, friction, r, p.factor.to_numpy(k), holds, NEWTON):
+                    return found[0], SolveResult(iterations + found[1], residual(found[0]), True)
+            if not result.converged:
+                r, history = augmented_lagrangian.solve(W.tocsr(), b, friction, r, goal, outer)
+                result = SolveResult(result.iterations + len(history) - 1, history[-1], history[-1] <= goal)
+                if not result.converged or holds(r):
+                    break
+                fill_field(p.r, r)
+            goal *= 0.5 * limit / residual(r, factor)
+        return r, replace(result, iterations=iterations)
 
     @property
     def field_bytes(self) -> dict[str, int]:

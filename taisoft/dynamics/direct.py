@@ -3,10 +3,9 @@ of small stages whose iterations take longer, as where bodies are stiff or thin,
 
 The change s of v satisfies A s = J^T r - r_0, r_0 the residual without contacts. With s eliminated, the impulses r solve
     u = W r + b,   W = J A^-1 J^T,   b = u_0 - J A^-1 r_0
-with the laws of contact, u_0 the contacts' velocities at the start: Gauss-Seidel sweeps on W, then, if they do not suffice, an
-augmented Lagrangian on the host. With A = L L^T (`multifrontal`), W is Y^T Y with Y = L^-1 J^T. The r-factors come from W: those
-from the diagonal of A would be too large by as much as the bodies are stiff, and the laws' residual with them. A result that
-does not meet the laws with these counts if it meets them at least as well as the iterations, with their r-factors.
+with the laws of contact, u_0 the contacts' velocities at the start: by Gauss-Seidel sweeps on W, then, if they do not suffice, by
+Newton's method or an augmented Lagrangian on the host. With A = L L^T (`multifrontal`), W is Y^T Y with Y = L^-1 J^T. The laws'
+residual is measured with the stage's r-factors, too, as that of iterations.
 A couples no nodes of different parts, bodies in general, so that W is found part by part.
 Weakness: W is dense within each part: only stages with few contacts a body are solved so.
 """
@@ -15,6 +14,7 @@ import math
 from typing import Any
 
 import numpy as np
+import scipy.linalg as sl
 import scipy.sparse as sp
 
 from taisoft.backend.arrays import download, upload
@@ -23,7 +23,7 @@ from taisoft.contact.matrix_contacts import OUTER, MatrixContacts, frames
 from taisoft.contact.problem import read_entries
 from taisoft.dynamics.contact_terms import StageContacts
 from taisoft.fem.model import Model
-from taisoft.linear.block_csr import BlockCsr, unpacked
+from taisoft.linear.block_csr import BLOCK, BlockCsr
 from taisoft.linear.multifrontal import Multifrontal
 from taisoft.ranges import owners
 from taisoft.scene.rigid import FRAME
@@ -35,18 +35,20 @@ class DirectSolver:
     # most rows of W, Gauss-Seidel sweeps, and iterations of the augmented Lagrangian after these: of rigid bodies alone, and of
     # others, whose W takes longer
     RIGID, SOFT = (2000, 1000, OUTER), (900, 200, 5)
-    # the laws' residual with the r-factors of W is reduced to FRACTION of their tolerance, and further, in up to TIGHTER solves,
-    # until that with those of the stage is MET times the tolerance: stiff bodies have larger ones
-    FRACTION, MET, TIGHTER = 0.1, 0.5, 3
-    # [s]: what a solve takes beside factorisation and W, and a number of L times a row of W, measured on one core
-    CALLS, PRODUCT = 2e-3, 1.5e-10
-    LARGEST = 0.1  # [s] most that a direct solve may be expected to take
+    # of the laws' tolerance: sweeps end at FRACTION, with the r-factors of W; where those of the stage, which stiff bodies make
+    # far larger, leave more than MET, Newton's method goes on
+    FRACTION, MET = 0.1, 0.5
+    # [s], measured on one core: what a solve takes beside factorisation and W, a number of L times a row of W, and a row of W
+    # cubed, for iterations on it
+    CALLS, PRODUCT, DENSE = 4e-3, 2.2e-10, 4e-10
+    WORTH, LARGEST = 0.03, 0.1  # [s] most that one may be expected to take, to be tried before iterations end, and at all
 
     def __init__(self, model: Model, matrix: BlockCsr, x_hat: Any):
         """x_hat: of the stage, see `StageWork`."""
         m = model
         self._model, self._A, self._x_hat, self._contacts = model, matrix, x_hat, MatrixContacts(model.on_cpu)
-        self.is_rigid = m.has_rigid_tets and FRAME * m.rigid_tets.n + m.dependents.n == m.n_nodes  # then it solves all stages
+        # then it solves all stages
+        self.is_rigid = m.has_rigid_tets and FRAME * m.rigid_tets.n + m.dependents.n == m.n_nodes
         self._max_rows, *self._limits = self.RIGID if self.is_rigid else self.SOFT
         self._nodes = np.flatnonzero(m.dependents.number.to_numpy() < 0) if m.has_dependents else np.arange(m.n_nodes)
         self._factor: Multifrontal | None = None
@@ -66,8 +68,8 @@ class DirectSolver:
             return math.inf
         if self._factor is None:
             self._analyse()
-        size = self._factor.n_entries
-        return self._factor.seconds + self.CALLS + 3 * n_contacts * size * self.PRODUCT
+        rows = 3 * n_contacts
+        return self._factor.seconds + self.CALLS + rows * self._factor.n_entries * self.PRODUCT + rows**3 * self.DENSE
 
     def _analyse(self) -> None:
         """Find what depends on the pattern of A alone."""
@@ -79,17 +81,18 @@ class DirectSolver:
         among = np.flatnonzero((row >= 0) & (column >= 0))
         row, column = np.concatenate([row[among], own]), np.concatenate([column[among], own])
         order = np.lexsort((column, row))
-        self._blocks = np.concatenate([among, self._A.column.shape[0] + self._nodes])[
-            order
-        ]  # among those of A, then its diagonal
-        self._row, self._column = row[order], column[order]
-        self._start = np.concatenate([[0], np.cumsum(np.bincount(row, minlength=len(own)))])
-        self._number, self._factor = number, Multifrontal(self._start, self._column)
-        axis, place = np.arange(3), self._factor.place
-        i, j = place[3 * self._row[:, None, None] + axis[:, None]], place[3 * self._column[:, None, None] + axis]
-        i, j = (one.reshape(-1) for one in np.broadcast_arrays(i, j))
-        self._lower = np.flatnonzero(i >= j)
-        self._places = self._factor.places(i[self._lower], j[self._lower])
+        blocks = np.concatenate([among, self._A.column.shape[0] + self._nodes])[order]  # among those of A, then its diagonal
+        row, column = row[order], column[order]
+        start = np.concatenate([[0], np.cumsum(np.bincount(row, minlength=len(own)))])
+        self._number, self._factor = number, Multifrontal(start, column)
+        # entries of the lower triangle: row and column in A and in the order of elimination, and place among the stored numbers
+        axis = np.arange(3)
+        at = [3 * row[:, None, None] + axis[:, None], 3 * column[:, None, None] + axis]
+        at.append(BLOCK * blocks[:, None, None] + 4 * axis + axis[:, None])
+        i, j, stored = (one.reshape(-1) for one in np.broadcast_arrays(*at))
+        lower = self._factor.place[i] >= self._factor.place[j]
+        self._row, self._column, self._stored = i[lower], j[lower], stored[lower]
+        self._places = self._factor.places(self._factor.place[self._row], self._factor.place[self._column])
 
     def prepare(self, stage_contacts: StageContacts) -> bool:
         """Factorise the matrix that was formed, and assemble W; return whether that is possible and not too large.
@@ -113,12 +116,14 @@ class DirectSolver:
     def _factorise(self, k: StageContacts) -> None:
         """Factorise A on the free axes, without the contacts' terms."""
         self._free = (self._model.free.to_numpy()[self._nodes] > 0.0).astype(np.float64)
-        blocks = unpacked(np.concatenate(download([self._A.value, k.coupling.base]))[self._blocks])
+        value, diagonal = download([self._A.value, k.coupling.base])
+        values = np.concatenate([value.reshape(-1), diagonal.reshape(-1)])[self._stored].astype(np.float64)
         if not self._free.all():
-            blocks *= self._free[self._row][:, :, None] * self._free[self._column][:, None, :]
-            blocks[self._row == self._column] += np.eye(3) * (1.0 - self._free)[:, None, :]
-        self._matrix = sp.bsr_matrix((blocks, self._column, self._start))
-        self._factor.factorise(blocks.reshape(-1)[self._lower], self._places)
+            free = self._free.reshape(-1)
+            values *= free[self._row] * free[self._column]
+            values += (self._row == self._column) * (1.0 - free[self._row])
+        self._values = values
+        self._factor.factorise(values, self._places)
 
     def _find_delassus(self, k: StageContacts) -> None:
         """Find W, and Y of each part, from the rows of J that are not 0 there: not those of tangents without friction."""
@@ -145,7 +150,8 @@ class DirectSolver:
                 self._halves.append((unknowns, rows, Y))
                 touched = np.flatnonzero(own.reshape(-1, 3).any(axis=1))
                 W, place = np.zeros((3 * len(touched),) * 2), np.searchsorted(touched, rows // 3) * 3 + rows % 3
-                W[place[:, None], place] = Y.T @ Y
+                half = sl.blas.dsyrk(1.0, Y.T, lower=1)
+                W[place[:, None], place] = half + np.tril(half, -1).T
                 keys.append((touched[:, None] * n + touched).reshape(-1))
                 blocks.append(W.reshape(len(touched), 3, -1, 3).swapaxes(1, 2).reshape(-1, 3, 3))
         self._W = sp.bsr_matrix((3 * n, 3 * n), blocksize=(3, 3))  # if no contact can move
@@ -157,12 +163,12 @@ class DirectSolver:
             self._W = sp.bsr_matrix((whole, key % n, start), shape=(3 * n, 3 * n))
 
     def solve(
-        self, stage_contacts: StageContacts, beta: float, tolerance: float, acceptable: float
+        self, stage_contacts: StageContacts, beta: float, tolerance: float, acceptable: float, with_residual: bool
     ) -> tuple[int, bool, float] | None:
         """Move a linearised stage, whose matrix is prepared, to its solution; return (iterations, converged, |r|).
 
-        tolerance: of the laws' residual. acceptable: that residual with the r-factors of the contacts, not of W, above which a
-        result that does not meet the laws is rejected, the state kept, and None returned.
+        tolerance: of the laws' residual. acceptable: that residual above which a result is rejected, the state kept, and None
+        returned. with_residual: whether to measure |r|, which is rounding; else it is 0.
         """
         m, k = self._model, stage_contacts
         p, n = k.problem, int(k.problem.count[0])
@@ -176,14 +182,9 @@ class DirectSolver:
         for unknowns, rows, Y in self._halves:
             b[rows] -= y[unknowns] @ Y
         friction, factor, r = download([p.friction, p.factor, k.work.kept], n)
-        goal, iterations = self.FRACTION * tolerance, 0
-        for _ in range(self.TIGHTER):
-            r, found = self._contacts.solve(self._W, b, friction, r, "gauss_seidel", goal, *self._limits)
-            iterations += found.iterations
-            law_residual = augmented_lagrangian.find_residual(self._W, b, friction, r, factor)
-            if not (found.converged and law_residual > self.MET * tolerance):
-                break
-            goal *= 0.5 * self.MET * tolerance / law_residual
+        goals = self.FRACTION * tolerance, self.MET * tolerance
+        r, found = self._contacts.solve(self._W, b, friction, r, "gauss_seidel", goals[0], *self._limits, factor, goals[1])
+        law_residual = augmented_lagrangian.find_residual(self._W, b, friction, r, factor)
         if not (self.is_rigid or law_residual <= acceptable):  # also if it is not a number
             return None
         pushed = np.zeros_like(y)
@@ -195,9 +196,15 @@ class DirectSolver:
         v[self._nodes] = (x[self._nodes] - self._x_hat.to_numpy()[self._nodes]) / beta
         impulses[:n] = r
         upload([(m.state.x, x), (m.state.v, v), (p.r, impulses)])
-        left, (contact, node, J) = (self._matrix @ change + residual).reshape(-1, 3), self._J
+        return found.iterations, law_residual <= tolerance, self._imbalance(change, residual, r) if with_residual else 0.0
+
+    def _imbalance(self, change: np.ndarray, residual: np.ndarray, r: np.ndarray) -> float:
+        """|A s - J^T r + r_0| of a change s (n,)."""
+        n, (contact, node, J) = len(change), self._J
+        lower = sp.csr_matrix((self._values, (self._row, self._column)), shape=(n, n))
+        left = (lower @ change + lower.T @ change - lower.diagonal() * change + residual).reshape(-1, 3)
         np.subtract.at(left, node, np.einsum("eij,ei->ej", J, r[contact]))
-        return iterations, law_residual <= tolerance, float(np.linalg.norm(left))
+        return float(np.linalg.norm(left))
 
     def _velocities(self, k: StageContacts, x: np.ndarray, beta: float) -> np.ndarray:
         """u (3k,) at positions x (n_nodes,3), see `contact_terms.stage_velocity_of`."""

@@ -15,6 +15,7 @@ import numpy as np
 import taichi as ti
 
 from taisoft.backend.arrays import FieldArena, download, upload
+from taisoft.backend.blas import one_thread
 from taisoft.contact.problem import RESIDUAL, find_factors
 from taisoft.dynamics import rigid_balance
 from taisoft.dynamics.contact_terms import (
@@ -441,7 +442,9 @@ class StageSystem:
     def patience(self) -> float:
         """Duration [s] of iterations on a frictional problem after which a direct solve is expected to have been faster."""
         direct = self._direct
-        return math.inf if direct is None or self._rejects_direct else direct.seconds(self.n_contacts)
+        if direct is None or self._rejects_direct or (seconds := direct.seconds(self.n_contacts)) > direct.WORTH:
+            return math.inf
+        return seconds
 
     def duration_of(self, iterations: float, n: int) -> float:
         """Expected duration [s] of n linear solves and updates of multipliers, with that number of iterations in all."""
@@ -456,9 +459,10 @@ class StageSystem:
         direct = self._direct
         if direct is None or self._rejects_direct or not (first or direct.is_rigid):
             return None
-        found = None
-        if direct.prepare(self.contacts):
-            found = direct.solve(self.contacts, self.stage.beta, tolerance, max(tolerance, self.contact_residual))
+        found, most = None, max(tolerance, self.contact_residual)
+        with one_thread():
+            if direct.prepare(self.contacts):
+                found = direct.solve(self.contacts, self.stage.beta, tolerance, most, self.stage.linearised)
         self._rejects_direct = found is None
         return found
 

@@ -1,0 +1,72 @@
+"""Semismooth Newton method for a contact problem with a dense W: few iterations from a start near the solution.
+
+A root of F(r) = r - prox(r - f (W r + b)) is sought with a derivative of prox, in which the friction disk's radius follows the
+normal impulse. Redundant contacts, whose W is singular, are separated by SHIFT. A step is shortened until |F| falls.
+Source: Alart and Curnier, "A mixed formulation for frictional contact problems prone to Newton like solution methods", CMAME 92,
+1991. Weakness: far from the solution it may cycle, so that sweeps come first.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+
+from taisoft.contact.augmented_lagrangian import prox
+
+SHIFT = 1e-7  # added to the diagonal of F's derivative, whose entries are of the order of 1
+MAX_HALVINGS = 5
+
+
+def solve(
+    W: np.ndarray,
+    b: np.ndarray,
+    friction: np.ndarray,
+    r: np.ndarray,
+    factor: np.ndarray,
+    holds: Callable[[np.ndarray], bool],
+    most: int,
+) -> tuple[np.ndarray, int] | None:
+    """Return impulses (k,3) that hold, and the number of iterations from the start r (k,3); None if `most` do not suffice.
+
+    W: (3k,3k); b: (3k,); friction: (k,); factor: (k,2) r-factors f.
+    """
+    k, f = len(friction), factor[:, [0, 1, 1]]
+
+    def evaluate(r: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+        z = r - f * (W @ r.reshape(-1) + b).reshape(-1, 3)
+        F = r - prox(z, friction)
+        return z, F, float(np.linalg.norm(F))
+
+    scaled, own = (f.reshape(-1, 1) * W).reshape(k, 3, 3 * k), np.arange(k)
+    z, F, size = evaluate(r)
+    for n in range(1, most + 1):
+        D = derivative(z, friction)
+        slope = D @ scaled
+        slope.reshape(k, 3, k, 3)[own, :, own, :] += (1.0 + SHIFT) * np.eye(3) - D
+        try:
+            step = np.linalg.solve(slope.reshape(3 * k, 3 * k), F.reshape(-1)).reshape(k, 3)
+        except np.linalg.LinAlgError:
+            return None
+        for halvings in range(MAX_HALVINGS + 1):
+            found = evaluate(r - 0.5**halvings * step)
+            if found[2] < size:
+                break
+        else:
+            return None
+        r, (z, F, size) = r - 0.5**halvings * step, found
+        if holds(r):
+            return r, n
+    return None
+
+
+def derivative(z: np.ndarray, friction: np.ndarray) -> np.ndarray:
+    """A derivative (k,3,3) of prox at z (k,3)."""
+    size, radius = np.hypot(z[:, 1], z[:, 2]), friction * z[:, 0]
+    presses = z[:, 0] > 0.0
+    sticks, slips = presses & (size <= radius), presses & (size > radius)
+    D = np.zeros((len(z), 3, 3))
+    D[presses, 0, 0] = 1.0
+    D[sticks, 1, 1] = D[sticks, 2, 2] = 1.0
+    e = z[slips, 1:] / size[slips, None]
+    D[slips, 1:, 0] = friction[slips, None] * e
+    D[slips, 1:, 1:] = (radius / np.maximum(size, 1e-300))[slips, None, None] * (np.eye(2) - e[:, :, None] * e[:, None, :])
+    return D
