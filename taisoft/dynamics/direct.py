@@ -38,6 +38,7 @@ class DirectSolver:
     # of the laws' tolerance: sweeps end at FRACTION, with the r-factors of W; where those of the stage, which stiff bodies make
     # far larger, leave more than MET, Newton's method goes on
     FRACTION, MET = 0.1, 0.5
+    ROUNDS = 4  # solves of a problem, each with the contacts that the last one would close
     # [s], measured on one core: what a solve takes beside factorisation and W, a number of L times a row of W, and a row of W
     # cubed, for iterations on it
     CALLS, PRODUCT, DENSE = 4e-3, 2.2e-10, 4e-10
@@ -52,23 +53,20 @@ class DirectSolver:
         self._max_rows, *self._limits = self.RIGID if self.is_rigid else self.SOFT
         self._nodes = np.flatnonzero(m.dependents.number.to_numpy() < 0) if m.has_dependents else np.arange(m.n_nodes)
         self._factor: Multifrontal | None = None
-        self._has_factor = self._has_delassus = False  # of the present matrix and contacts
+        self._has_factor = False  # of the present matrix
 
     def matrix_changed(self) -> None:
         """Update for a matrix that was formed."""
-        self._has_factor = self._has_delassus = False
+        self._has_factor = False
 
-    def contacts_changed(self) -> None:
-        """Update for other contacts on the same matrix."""
-        self._has_delassus = False
-
-    def seconds(self, n_contacts: int) -> float:
-        """Expected duration of a solve, infinite if there are too many contacts or nodes."""
-        if not 0 < 3 * n_contacts <= self._max_rows:
+    def seconds(self, stage_contacts: StageContacts) -> float:
+        """Expected duration of a solve with the contacts that have an impulse, infinite if there are too many contacts."""
+        n = int(stage_contacts.problem.count[0])
+        if not 0 < 3 * n <= self._max_rows:
             return math.inf
         if self._factor is None:
             self._analyse()
-        rows = 3 * n_contacts
+        rows = 3 * np.count_nonzero(stage_contacts.problem.r.to_numpy(n)[:, 0])
         return self._factor.seconds + self.CALLS + rows * self._factor.n_entries * self.PRODUCT + rows**3 * self.DENSE
 
     def _analyse(self) -> None:
@@ -95,11 +93,11 @@ class DirectSolver:
         self._places = self._factor.places(self._factor.place[self._row], self._factor.place[self._column])
 
     def prepare(self, stage_contacts: StageContacts) -> bool:
-        """Factorise the matrix that was formed, and assemble W; return whether that is possible and not too large.
+        """Factorise the matrix that was formed; return whether that is possible and a solve is not expected to take too long.
 
         Raises numpy.linalg.LinAlgError if A is indefinite, of rigid bodies alone: contacts may hold soft ones whose A is.
         """
-        if self.seconds(int(stage_contacts.problem.count[0])) > self.LARGEST:
+        if self.seconds(stage_contacts) > self.LARGEST:
             return False
         try:
             if not self._has_factor:
@@ -108,9 +106,7 @@ class DirectSolver:
             if self.is_rigid:
                 raise
             return False
-        if not self._has_delassus:
-            self._find_delassus(stage_contacts)
-        self._has_factor = self._has_delassus = True
+        self._has_factor = True
         return True
 
     def _factorise(self, k: StageContacts) -> None:
@@ -125,18 +121,22 @@ class DirectSolver:
         self._values = values
         self._factor.factorise(values, self._places)
 
-    def _find_delassus(self, k: StageContacts) -> None:
-        """Find W, and Y of each part, from the rows of J that are not 0 there: not those of tangents without friction."""
-        p, n, factor = k.problem, int(k.problem.count[0]), self._factor
+    def _find_rows(self, k: StageContacts) -> None:
+        """Find the rows of J (entries, axes of the contact, of the node), 0 for tangents without friction."""
+        p = k.problem
         contact, node, weight = read_entries(p)
         J = frames(p)
-        J[download([p.friction], n)[0] == 0.0, 1:] = 0.0
+        J[download([p.friction], len(J))[0] == 0.0, 1:] = 0.0
         node = self._number[node]
-        J = weight[:, None, None] * J[contact] * self._free[node][:, None, :]
-        self._J = contact, node, J
-        entry, axis, of = np.nonzero(J)
+        self._J = contact, node, weight[:, None, None] * J[contact] * self._free[node][:, None, :]
+
+    def _find_delassus(self, active: np.ndarray) -> sp.bsr_matrix:
+        """Return W of the active contacts (k,), numbered anew; keep the unknowns, rows and Y of each part where J is not 0."""
+        (contact, node, J), factor, n = self._J, self._factor, int(active.sum())
+        contact = np.where(active, np.cumsum(active) - 1, -1)[contact]
+        entry, axis, of = np.nonzero(J * (contact >= 0)[:, None, None])
         row, column, J = 3 * contact[entry] + axis, factor.place[3 * node[entry] + of], J[entry, axis, of]
-        keys, blocks, self._halves = [], [], []  # of W; (unknowns, rows, Y) of each part
+        keys, blocks, self._halves = [], [], []
         for part in factor.parts:
             unknowns = factor.unknowns_of(part)
             inside = (column >= unknowns.start) & (column < unknowns.stop)
@@ -154,21 +154,22 @@ class DirectSolver:
                 W[place[:, None], place] = half + np.tril(half, -1).T
                 keys.append((touched[:, None] * n + touched).reshape(-1))
                 blocks.append(W.reshape(len(touched), 3, -1, 3).swapaxes(1, 2).reshape(-1, 3, 3))
-        self._W = sp.bsr_matrix((3 * n, 3 * n), blocksize=(3, 3))  # if no contact can move
-        if keys:
-            key, at = np.unique(np.concatenate(keys), return_inverse=True)
-            whole = np.zeros((len(key), 3, 3))
-            np.add.at(whole, at, np.concatenate(blocks))
-            start = np.concatenate([[0], np.cumsum(np.bincount(key // n, minlength=n))])
-            self._W = sp.bsr_matrix((whole, key % n, start), shape=(3 * n, 3 * n))
+        if not keys:  # no contact can move
+            return sp.bsr_matrix((3 * n, 3 * n), blocksize=(3, 3))
+        key, at = np.unique(np.concatenate(keys), return_inverse=True)
+        whole = np.zeros((len(key), 3, 3))
+        np.add.at(whole, at, np.concatenate(blocks))
+        start = np.concatenate([[0], np.cumsum(np.bincount(key // n, minlength=n))])
+        return sp.bsr_matrix((whole, key % n, start), shape=(3 * n, 3 * n))
 
     def solve(
         self, stage_contacts: StageContacts, beta: float, tolerance: float, acceptable: float, with_residual: bool
     ) -> tuple[int, bool, float] | None:
         """Move a linearised stage, whose matrix is prepared, to its solution; return (iterations, converged, |r|).
 
-        tolerance: of the laws' residual. acceptable: that residual above which a result is rejected, the state kept, and None
-        returned. with_residual: whether to measure |r|, which is rounding; else it is 0.
+        W is that of contacts that press or close, with those that the solution would close, until there are none. tolerance: of
+        the laws' residual. acceptable: that residual above which a result is rejected, the state kept, and None returned.
+        with_residual: whether to measure |r|, which is rounding; else it is 0.
         """
         m, k = self._model, stage_contacts
         p, n = k.problem, int(k.problem.count[0])
@@ -178,25 +179,64 @@ class DirectSolver:
         y = residual[self._factor.order]
         for part in self._factor.parts:
             self._factor.forward(part, y[self._factor.unknowns_of(part), None])
-        b = self._velocities(k, x, beta)
-        for unknowns, rows, Y in self._halves:
-            b[rows] -= y[unknowns] @ Y
+        self._find_rows(k)
+        start = self._velocities(k, x, beta)
         friction, factor, r = download([p.friction, p.factor, k.work.kept], n)
-        goals = self.FRACTION * tolerance, self.MET * tolerance
-        r, found = self._contacts.solve(self._W, b, friction, r, "gauss_seidel", goals[0], *self._limits, factor, goals[1])
-        law_residual = augmented_lagrangian.find_residual(self._W, b, friction, r, factor)
+        active, iterations = (r[:, 0] > 0.0) | (start[:, 0] < 0.0), 0
+        for _ in range(self.ROUNDS):
+            r, change, n_iterations = self._solve_active(active, start, y, r, friction, factor, tolerance)
+            iterations += n_iterations
+            u = start + self._contact_velocities(change, n)
+            if not (closes := ~active & (u[:, 0] < 0.0)).any():
+                break
+            active |= closes
+        z = r - factor[:, [0, 1, 1]] * u
+        law_residual = augmented_lagrangian.relative(
+            np.linalg.norm(r - augmented_lagrangian.prox(z, friction)), np.linalg.norm(r)
+        )
         if not (self.is_rigid or law_residual <= acceptable):  # also if it is not a number
             return None
-        pushed = np.zeros_like(y)
-        for unknowns, rows, Y in self._halves:
-            pushed[unknowns] = Y @ r.reshape(-1)[rows]
-        change = self._factor.backward(pushed - y)
         impulses = p.r.to_numpy()
         x[self._nodes] += beta * change.reshape(-1, 3)
         v[self._nodes] = (x[self._nodes] - self._x_hat.to_numpy()[self._nodes]) / beta
         impulses[:n] = r
         upload([(m.state.x, x), (m.state.v, v), (p.r, impulses)])
-        return found.iterations, law_residual <= tolerance, self._imbalance(change, residual, r) if with_residual else 0.0
+        return iterations, law_residual <= tolerance, self._imbalance(change, residual, r) if with_residual else 0.0
+
+    def _solve_active(
+        self,
+        active: np.ndarray,
+        start: np.ndarray,
+        y: np.ndarray,
+        r: np.ndarray,
+        friction: np.ndarray,
+        factor: np.ndarray,
+        tolerance: float,
+    ) -> tuple[np.ndarray, np.ndarray, int]:
+        """Return impulses (k,3), which only active contacts have, the change of v (n,), and the number of iterations.
+
+        start: (k,3) u; y: L^-1 r_0 (n,); r: impulses to start from.
+        """
+        W, b = self._find_delassus(active), start[active].reshape(-1)
+        for unknowns, rows, Y in self._halves:
+            b[rows] -= y[unknowns] @ Y
+        goals = self.FRACTION * tolerance, self.MET * tolerance
+        found, pushed, impulses, n = np.zeros_like(r), -y, r[active], 0
+        if active.any():
+            solve, given = self._contacts.solve, (friction[active], impulses, "gauss_seidel", goals[0], *self._limits)
+            impulses, result = solve(W, b, *given, factor[active], goals[1])
+            n = result.iterations
+        for unknowns, rows, Y in self._halves:
+            pushed[unknowns] += Y @ impulses.reshape(-1)[rows]
+        found[active] = impulses
+        return found, self._factor.backward(pushed), n
+
+    def _contact_velocities(self, change: np.ndarray, n: int) -> np.ndarray:
+        """J s (k,3) of a change s (n,) of v."""
+        contact, node, J = self._J
+        found = np.zeros((n, 3))
+        np.add.at(found, contact, np.einsum("eij,ej->ei", J, change.reshape(-1, 3)[node]))
+        return found
 
     def _imbalance(self, change: np.ndarray, residual: np.ndarray, r: np.ndarray) -> float:
         """|A s - J^T r + r_0| of a change s (n,)."""
@@ -207,7 +247,7 @@ class DirectSolver:
         return float(np.linalg.norm(left))
 
     def _velocities(self, k: StageContacts, x: np.ndarray, beta: float) -> np.ndarray:
-        """u (3k,) at positions x (n_nodes,3), see `contact_terms.stage_velocity_of`."""
+        """u (k,3) at positions x (n_nodes,3), see `contact_terms.stage_velocity_of`."""
         n = int(k.problem.count[0])
         gap, offset = download([k.work.gap_minus_target, k.work.tangential_offset], n)
         contact, node, weight = read_entries(k.problem)
@@ -215,7 +255,7 @@ class DirectSolver:
         np.add.at(moved, contact, weight[:, None] * (x - k.x_start.to_numpy())[node])
         u = np.einsum("kij,kj->ki", frames(k.problem), moved + offset)
         u[:, 0] = gap + np.einsum("kj,kj->k", k.problem.normal.to_numpy(n), moved)
-        return u.reshape(-1) / beta
+        return u / beta
 
     @property
     def field_bytes(self) -> dict[str, int]:

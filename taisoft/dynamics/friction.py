@@ -85,7 +85,7 @@ class Friction:
 
         Directly where that applies, and once these have taken longer. directly: at once.
         """
-        if (found := cls._solve_directly(system, goal, r, directly)) is not None:
+        if (directly or system.is_rigid) and (found := cls._solve_directly(system, goal, r, after=False)) is not None:
             return found
         patience = system.patience
         if goal.r_scale != system.r_scale:
@@ -121,7 +121,7 @@ class Friction:
                 rounding = r <= cls.ROUNDING * system.floor and r > 0.5 * before
         system.r_scale = FIRST_R
         if not (converged or negative or system.budget.ran_out):
-            if (found := cls._solve_directly(system, goal, r, first=True)) is not None:
+            if (found := cls._solve_directly(system, goal, r, after=True)) is not None:
                 return found._replace(solves=solves + 1, linear=linear, updates=updates)
             if patience < math.inf and solves < goal.max_solves:
                 found = cls.solve(system, goal._replace(max_solves=goal.max_solves - solves), r)
@@ -129,10 +129,10 @@ class Friction:
         return Solution(solves, linear, updates, negative, converged, r, scale)
 
     @staticmethod
-    def _solve_directly(system: StageSystem, goal: Goal, r: float, first: bool) -> Solution | None:
+    def _solve_directly(system: StageSystem, goal: Goal, r: float, after: bool) -> Solution | None:
         """Return the result of a direct solve, None if that does not apply."""
         try:
-            found = system.solve_directly(goal.law, first)
+            found = system.solve_directly(goal.law, after)
         except np.linalg.LinAlgError:
             return Solution(1, 0, 0, True, False, r)
         if found is None:

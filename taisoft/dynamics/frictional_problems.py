@@ -22,6 +22,7 @@ class FrictionalProblems:
     def __init__(self, system: StageSystem, stage: Stage):
         self._system, self._stage = system, stage
         self.tight = False  # whether the last problem was near the floor
+        self._was_direct = False  # whether it was solved directly
         # laws that hold better than they must let |r| converge in fewer iterations, where they can
         self._law_aim = min(stage.contact_tolerance, stage.tolerance)
         self._r_scale, self._max_r_scale = FIRST_R, MAX_R_FRICTIONLESS
@@ -50,16 +51,19 @@ class FrictionalProblems:
 
     @property
     def is_direct(self) -> bool:
-        """Whether the next problem is to be solved directly at once: as the last one was, but for a trial now and then."""
-        return self._system.n_direct % self.TRIAL > 0
+        """Whether the next problem is to be solved directly at once: as the stage's last one was, or as those of steps before
+        were, whose iterations took too long, but for a trial now and then."""
+        return self._was_direct or self._system.n_direct % self.TRIAL > 0
 
-    def count(self, found: Solution) -> None:
-        """Count the problems that were solved directly."""
-        self._system.n_direct = self._system.n_direct + 1 if found.direct else 0
+    def count(self, goal: Goal, found: Solution) -> None:
+        """Count the problems in a row that were solved directly since iterations took too long."""
+        self._was_direct, n = found.direct, self._system.n_direct
+        took_long = n > 0 or 1 < found.solves <= goal.max_solves
+        self._system.n_direct = n + 1 if found.direct and took_long else 0
 
     def learn(self, goal: Goal, found: Solution) -> None:
         """Take account of a problem's solution."""
-        self.count(found)
+        self.count(goal, found)
         if not (found.converged or found.negative):
             self._law_aim = self._stage.contact_tolerance
         if self._system.frictionless and not (found.negative or found.direct):

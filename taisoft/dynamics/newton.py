@@ -320,7 +320,7 @@ class Newton:
             solves = min(self.LINEARISED_SOLVES, system.budget.left)
             goal = Goal(norm, stage.contact_tolerance, norm, forcing, max_solves=solves)
             found = self._add_friction(Friction.solve(system, goal, self.r, self.problems.is_direct))
-            self.problems.count(found)
+            self.problems.count(goal, found)
             self._count(found.solves)
             if not found.negative or projected:
                 break

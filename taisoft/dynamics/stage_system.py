@@ -317,8 +317,6 @@ class StageSystem:
             upload([(self.contacts.coupling.base, base)])
             move(self.model, self.work, self.contacts, self.kind, STAY, 1.0, self.stage.c, self.stage.beta)
         self._same_matrix = False  # its rows are, but not those of the contacts' terms
-        if self._direct is not None:
-            self._direct.contacts_changed()
         self.find_factors()
         return True
 
@@ -442,7 +440,7 @@ class StageSystem:
     def patience(self) -> float:
         """Duration [s] of iterations on a frictional problem after which a direct solve is expected to have been faster."""
         direct = self._direct
-        if direct is None or self._rejects_direct or (seconds := direct.seconds(self.n_contacts)) > direct.WORTH:
+        if direct is None or self._rejects_direct or (seconds := direct.seconds(self.contacts)) > direct.WORTH:
             return math.inf
         return seconds
 
@@ -450,21 +448,26 @@ class StageSystem:
         """Expected duration [s] of n linear solves and updates of multipliers, with that number of iterations in all."""
         return iterations * self.ITERATION * (2 * self.matrix.n_edges + self.model.n_nodes) + n * self.CALLS
 
-    def solve_directly(self, tolerance: float, first: bool) -> tuple[int, bool, float] | None:
+    def solve_directly(self, tolerance: float, after: bool) -> tuple[int, bool, float] | None:
         """Move a linearised stage to the solution of its frictional problem, see `direct`; None if that does not apply.
 
-        tolerance: of the laws' residual; first: whether iterations are not to be tried first. Returns (iterations, converged,
-        |r|); raises numpy.linalg.LinAlgError as `DirectSolver.prepare`.
+        tolerance: of the laws' residual; after: whether iterations were tried before. If it does not apply then, it is not tried
+        again in this stage. Returns (iterations, converged, |r|); raises numpy.linalg.LinAlgError as `DirectSolver.prepare`.
         """
         direct = self._direct
-        if direct is None or self._rejects_direct or not (first or direct.is_rigid):
+        if direct is None or self._rejects_direct:
             return None
         found, most = None, max(tolerance, self.contact_residual)
         with one_thread():
-            if direct.prepare(self.contacts):
+            if is_prepared := direct.prepare(self.contacts):
                 found = direct.solve(self.contacts, self.stage.beta, tolerance, most, self.stage.linearised)
-        self._rejects_direct = found is None
+        self._rejects_direct = found is None and (after or not is_prepared)
         return found
+
+    @property
+    def is_rigid(self) -> bool:
+        """Whether there are rigid bodies alone, whose problems are solved directly at once."""
+        return self._direct is not None and self._direct.is_rigid
 
     def end_linearised(self, accept: bool = True, new_multipliers: int = TO_IMPULSES) -> tuple[float, float]:
         """Restore nonlinear elastic forces; return (|r|, scale). y is then the velocity change since linearisation, base its x.
