@@ -7,6 +7,7 @@ machine, which may be one in software. First a run without a window, which also 
 the window by the clock, and a body is dragged to and fro by the mouse (xdotool); then both once more, with a budget of wall time
 for its implicit steps. Speeds are simulated over wall time: the window's is 1 at most. The latency is the wall time from the last
 look at the mouse that did not see a movement to a picture of a state whose step has used it. Run nothing else meanwhile.
+Last, the run without a window is repeated with all launches timed, for a table of what its steps spend, see `window_kinds`.
 Exit status: 0, or 1 if fewer than 20 pictures per second are shown, or the latency is above 100 ms where the simulation keeps up
 with the clock, without a budget.
 """
@@ -88,6 +89,22 @@ def window_table(rows: list[dict]) -> str:
     return table(rows, columns + with_budget if all("budget" in row for row in rows) else columns)  # older results have none
 
 
+def kinds_table(rows: list[dict]) -> str:
+    """A row per demo: percent of a mean step by kind."""
+
+    def percent_of(kind: str):
+        return lambda row: f"{100 * row['kinds']['seconds'][kind] / sum(row['kinds']['seconds'].values()):.0f}"
+
+    columns = (
+        ("<demo", "{[demo]}"),
+        ("step without window [ms]", lambda row: f"{1e3 * row['alone_step']:.3g}"),
+        ("sum of kinds", lambda row: f"{1e3 * sum(row['kinds']['seconds'].values()):.3g}"),
+        *((f"{kind} [%]", percent_of(kind)) for kind in rows[0]["kinds"]["seconds"]),
+        ("launches", lambda row: f"{sum(row['kinds']['launches'].values()):,.0f}"),
+    )
+    return table(rows, columns)
+
+
 def limits_of(rows: list[dict]) -> list[Limit]:
     """Required pictures per second of all demos, and latency of those that keep up with the clock."""
     found = [Limit(f"{row['demo']}: pictures/s", pictures_per_second(row), PICTURES, at_least=True) for row in rows]
@@ -113,6 +130,7 @@ def main(argv=None) -> int:
     finally:
         display.close()
     document.add(window_table(rows))
+    document.add("## What a mean step without a window spends\n\n" + kinds_table(rows))
     return document.finish(options, numbers | {"rows": rows}, [] if options.quick else limits_of(rows))
 
 

@@ -38,6 +38,7 @@ class Compiled:
         returned = function.__annotations__.get("return")  # several: a tuple[...]
         arrays, n_returned = sum(leaf[0] != COUNT for leaf in leaves), len(get_args(returned)) or int(returned is not None)
         self.signature = Signature(function.__name__, arrays, len(self._hosts), n_returned)
+        self.path = f"{function.__module__}.{function.__name__}"
         self._arguments = Arguments([list(kinds.values())[k] for k in self._numbers], leaves, packed)
         self._compile(function, [examples[k] for k in self._hosts])
 

@@ -7,9 +7,11 @@
 `device_only` refuses such accesses instead. Both work on the CPU too, where the host shares the memory with kernels. While they
 are open, watching methods stand in the place of those of `Array` and `Compiled`; otherwise they cost nothing. They may be nested,
 and close in reverse order. They do not see allocation, waiting (`ti.sync`), or what is done with an array's `host` later.
+`intercepted` hands every launch to a function, which may time it.
 """
 
 import contextlib
+import functools
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
@@ -109,6 +111,26 @@ def device_only() -> Iterator[None]:
         yield
     if refused:
         raise refused[0]
+
+
+@contextlib.contextmanager
+def intercepted(run: Callable[[str, Callable[[], Any]], Any]) -> Iterator[None]:
+    """Context in which run(path, launch) stands for each launch: it calls launch() and returns its result.
+
+    path: module and name of the kernel. A first launch with new records is prepared, and its kernel compiled, before `run`.
+    """
+    plain, was_watched = Compiled.launch, Kernels.watched
+
+    def launch(self, bound, arguments):
+        return run(self.path, functools.partial(plain, self, bound, arguments))
+
+    try:
+        Compiled.launch = launch
+        Kernels.watch(True)
+        yield
+    finally:
+        Kernels.watch(was_watched)
+        Compiled.launch = plain
 
 
 @contextlib.contextmanager

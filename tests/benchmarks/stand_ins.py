@@ -84,3 +84,5 @@ def ipc_record(job=None, **more) -> ipc_runs.Record:
 WINDOW = {"demo": "cube_on_box", "tets": 1215, "dt": 0.01, "step": 0.002, "longest_step": 0.02, "alone": 3.0, "speed": 1.0}
 WINDOW |= {"intervals": [0.04, 0.04, 0.07], "latencies": [0.05, 0.06, 0.09]}
 WINDOW |= {"budget": {"speed": 0.99, "step": 2e-3, "longest_step": 8e-3, "ended": 0.25, "residual": 0.03, "latencies": [0.07]}}
+SPENT = {"CG and factors": 8e-4, "friction": 6e-4, "assembly and forces": 2e-4, "search": 1e-4, "paths": 0.0, "launches": 1e-4}
+WINDOW |= {"alone_step": 0.0021, "kinds": {"seconds": SPENT | {"host": 2e-4}, "launches": {"search": 1100.0, "friction": 134.4}}}

@@ -309,7 +309,10 @@ RUNS = {
     "tolerance": Small((*BEAM, "--wish", "1"), ("| hanging beam | 1 | bdf2 | 8 |",), tolerance_small, tolerance_check),
     "window": Small(
         QUICK,
-        ("| cube_on_box | 1,215 | 10 | 2 | 20 | 3.00 | 1.00 | 25 | 70 | 60 | 87 | 0.99 | 4.0 | 25 | 0.03 | 70 |",),
+        (
+            "| cube_on_box | 1,215 | 10 | 2 | 20 | 3.00 | 1.00 | 25 | 70 | 60 | 87 | 0.99 | 4.0 | 25 | 0.03 | 70 |",
+            "| cube_on_box | 2.1 | 2 | 40 | 30 | 10 | 5 | 0 | 5 | 10 | 1,234 |",
+        ),
         window_small,
     ),
 }
