@@ -29,7 +29,7 @@ TEST_FILES = sorted(TESTS.rglob("*.py"))
 ORDER = (
     ("errors", "records", "files", "nested", "ranges", "machine", "processes", "compile_message", "display"),
     ("attributes",),
-    ("backend.private",),
+    ("backend.private", "backend.blas"),
     ("backend.tracing", "backend.device_memory"),
     ("backend.arrays",),
     ("backend.structure",),
