@@ -72,7 +72,8 @@ class MatrixContacts:
                     return found[0], SolveResult(iterations + found[1], residual(found[0]), True)
             if not result.converged:
                 r, history = augmented_lagrangian.solve(W.tocsr(), b, friction, r, goal, outer)
-                result = SolveResult(result.iterations + len(history) - 1, history[-1], history[-1] <= goal)
+                iterations += len(history) - 1
+                result = SolveResult(iterations, history[-1], history[-1] <= goal)
                 if not result.converged or holds(r):
                     break
                 fill_field(p.r, r)

@@ -29,6 +29,8 @@ def solve(
 
     W: (3k,3k); b: (3k,); friction: (k,); factor: (k,2) r-factors f.
     """
+    if holds(r):
+        return r, 0
     k, f = len(friction), factor[:, [0, 1, 1]]
 
     def evaluate(r: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
