@@ -25,7 +25,7 @@ def solve(
     holds: Callable[[np.ndarray], bool],
     most: int,
 ) -> tuple[np.ndarray, int] | None:
-    """Return impulses (k,3) that hold, and the number of iterations from the start r (k,3); None if `most` do not suffice.
+    """Return admissible impulses (k,3) that hold, and the number of iterations from the start r (k,3); None if more than `most`.
 
     W: (3k,3k); b: (3k,); friction: (k,); factor: (k,2) r-factors f.
     """
@@ -55,8 +55,8 @@ def solve(
         else:
             return None
         r, (z, F, size) = r - 0.5**halvings * step, found
-        if holds(r):
-            return r, n
+        if holds(admissible := prox(r, friction)):  # rounding may leave r a little outside its cone
+            return admissible, n
     return None
 
 

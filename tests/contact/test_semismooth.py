@@ -77,6 +77,7 @@ def test_random_problems(seed, friction, redundant):
     given = start.copy()
     found, n = solved(W, b, mu, start)
     assert n <= 12 and np.array_equal(start, given)
+    assert (found[:, 0] >= 0.0).all(), "a disk of negative radius gives no number"
     assert oracle.residual(W, b, mu, found) <= 1.01 * TOLERANCE
     assert max(oracle.breaks(W, b, mu, found).values()) < 1e-9
     assert np.abs(W @ (found - r).reshape(-1)).max() < 1e-8
