@@ -67,7 +67,7 @@ class MatrixContacts:
             r, iterations = p.r.to_numpy(k), iterations + result.iterations
             if result.converged and holds(r):
                 return r, replace(result, iterations=iterations)
-            if 3 * k <= DENSE:
+            if factor is not None and 3 * k <= DENSE:  # without, islands are solved one by one
                 if found := semismooth.solve(W.toarray(), b, friction, r, p.factor.to_numpy(k), holds, NEWTON):
                     return found[0], SolveResult(iterations + found[1], residual(found[0]), True)
             if not result.converged:
@@ -77,7 +77,7 @@ class MatrixContacts:
                 if not result.converged or holds(r):
                     break
                 fill_field(p.r, r)
-            goal *= 0.5 * limit / residual(r, factor)
+            goal *= 0.5 * limit / max(residual(r, factor), limit)
         return r, replace(result, iterations=iterations)
 
     @property

@@ -42,13 +42,14 @@ class DirectSolver:
     # [s], measured on one core: what a solve takes beside factorisation and W, a number of L times a row of W, and a row of W
     # cubed, for iterations on it
     CALLS, PRODUCT, DENSE = 4e-3, 2.2e-10, 4e-10
+    MOST_NODES = 4000  # of soft bodies: their factors take longer than LARGEST, and analysing the pattern seconds
     WORTH, LARGEST = 0.03, 0.1  # [s] most that one may be expected to take, to be tried before iterations end, and at all
 
     def __init__(self, model: Model, matrix: BlockCsr, x_hat: Any):
         """x_hat: of the stage, see `StageWork`."""
         m = model
         self._model, self._A, self._x_hat, self._contacts = model, matrix, x_hat, MatrixContacts(model.on_cpu)
-        # then it solves all stages
+        # then all stages are solved so at once, unless it is expected to take too long
         self.is_rigid = m.has_rigid_tets and FRAME * m.rigid_tets.n + m.dependents.n == m.n_nodes
         self._max_rows, *self._limits = self.RIGID if self.is_rigid else self.SOFT
         self._nodes = np.flatnonzero(m.dependents.number.to_numpy() < 0) if m.has_dependents else np.arange(m.n_nodes)
@@ -62,12 +63,14 @@ class DirectSolver:
     def seconds(self, stage_contacts: StageContacts) -> float:
         """Expected duration of a solve with the contacts that have an impulse, infinite if there are too many contacts."""
         n = int(stage_contacts.problem.count[0])
-        if not 0 < 3 * n <= self._max_rows:
+        if not 0 < 3 * n <= self._max_rows or (len(self._nodes) > self.MOST_NODES and not self.is_rigid):
             return math.inf
         if self._factor is None:
             self._analyse()
         rows = 3 * np.count_nonzero(stage_contacts.problem.r.to_numpy(n)[:, 0])
-        return self._factor.seconds + self.CALLS + rows * self._factor.n_entries * self.PRODUCT + rows**3 * self.DENSE
+        entries = self._factor.n_entries * min(1.0, 2.0 / len(self._factor.parts))  # a row touches two parts at most
+        dense = 0.0 if self.is_rigid else rows**3 * self.DENSE
+        return self._factor.seconds + self.CALLS + rows * entries * self.PRODUCT + dense
 
     def _analyse(self) -> None:
         """Find what depends on the pattern of A alone."""
@@ -176,9 +179,7 @@ class DirectSolver:
         # at the present x: iterations may have moved it, and the residual with it
         x, v, residual = download([m.state.x, m.state.v, k.residual_linear])
         residual = (self._free * residual.astype(np.float64)[self._nodes]).reshape(-1)
-        y = residual[self._factor.order]
-        for part in self._factor.parts:
-            self._factor.forward(part, y[self._factor.unknowns_of(part), None])
+        y = self._factor.halfway(residual)
         self._find_rows(k)
         start = self._velocities(k, x, beta)
         friction, factor, r = download([p.friction, p.factor, k.work.kept], n)

@@ -27,7 +27,10 @@ def set_frame_factors(m: Model, A: BlockCsr, diagonal, p: ContactProblem) -> Non
     J = weight[own, None, None] * frames(p)[contact]  # (entries, axes of the contact, of the node)
     soft, compliance = number < 0, np.zeros((len(is_rigid), 3))  # the latter: the diagonal of W
     np.add.at(compliance, contact[soft], np.einsum("eij,ej,eij->ei", J[soft], p.inverse_mass.to_numpy()[node[soft]], J[soft]))
-    inverse, free = _inverse_blocks(m, A, diagonal)
+    try:
+        inverse, free = _inverse_blocks(m, A, diagonal)
+    except np.linalg.LinAlgError:  # those of the diagonal stay
+        return
     body, corner = np.divmod(number[~soft], FRAME)
     sides, at = np.unique(contact[~soft] * len(inverse) + body, return_inverse=True)
     rows = np.zeros((len(sides) * FRAME, 3, 3))

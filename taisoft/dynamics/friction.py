@@ -53,7 +53,7 @@ class Goal(NamedTuple):
 
 
 class Solution(NamedTuple):
-    """Solution of a frictional problem. negative: its matrix is indefinite; direct: iterations did not solve it."""
+    """Solution of a frictional problem. negative: its matrix is indefinite; direct: it was solved directly."""
 
     solves: int
     linear: int
@@ -124,7 +124,7 @@ class Friction:
             if (found := cls._solve_directly(system, goal, r, after=True)) is not None:
                 return found._replace(solves=solves + 1, linear=linear, updates=updates)
             if patience < math.inf and solves < goal.max_solves:
-                found = cls.solve(system, goal._replace(max_solves=goal.max_solves - solves), r)
+                found = cls.solve(system, goal._replace(max_solves=goal.max_solves - solves, r_scale=scale), r)
                 return found._replace(solves=solves + found.solves, linear=linear + found.linear, updates=updates + found.updates)
         return Solution(solves, linear, updates, negative, converged, r, scale)
 

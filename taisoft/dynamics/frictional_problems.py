@@ -16,13 +16,14 @@ class FrictionalProblems:
     LAW_BALANCE = 0.03  # laws' residual over the required relative |r|; the next matrix would undo more accuracy
     MULTIPLIER_FRACTION = 0.3  # of the required |r|, ends the steps under one multiplier: updates at a large |r| overshoot
     NEAR_FLOOR = 4.0  # times the floor of |r|: below it, |r| may be mostly rigid motion
-    TRIAL = 16  # problems in a row that are solved directly before iterations are tried again
+    TRIAL = 16  # problems in a row that are solved directly before a stage tries iterations again
     R_STALLED, MAX_R_STALLED = 1000.0, 1e5  # smallest first R and upper bound without friction, where the laws stalled before
 
     def __init__(self, system: StageSystem, stage: Stage):
         self._system, self._stage = system, stage
         self.tight = False  # whether the last problem was near the floor
         self._was_direct = False  # whether it was solved directly
+        self._is_trial = system.n_direct >= self.TRIAL  # whether the stage's first problem is one
         # laws that hold better than they must let |r| converge in fewer iterations, where they can
         self._law_aim = min(stage.contact_tolerance, stage.tolerance)
         self._r_scale, self._max_r_scale = FIRST_R, MAX_R_FRICTIONLESS
@@ -53,11 +54,11 @@ class FrictionalProblems:
     def is_direct(self) -> bool:
         """Whether the next problem is to be solved directly at once: as the stage's last one was, or as those of steps before
         were, whose iterations took too long, but for a trial now and then."""
-        return self._was_direct or self._system.n_direct % self.TRIAL > 0
+        return self._was_direct or (self._system.n_direct > 0 and not self._is_trial)
 
     def count(self, goal: Goal, found: Solution) -> None:
         """Count the problems in a row that were solved directly since iterations took too long."""
-        self._was_direct, n = found.direct, self._system.n_direct
+        n, self._was_direct, self._is_trial = 0 if self._is_trial else self._system.n_direct, found.direct, False
         took_long = n > 0 or 1 < found.solves <= goal.max_solves
         self._system.n_direct = n + 1 if found.direct and took_long else 0
 

@@ -129,6 +129,7 @@ class StageSystem:
         self.scale = 0.0  # that |r| is relative to, at its last evaluation
         self.r_scale = 1.0  # R over the r-factors
         self.frictionless = False  # whether no contact of the stage has friction
+        self._rejects_direct = False  # whether a direct solve of this stage was rejected: others would be, too
         self.n_direct = 0  # frictional problems in a row that were solved directly
         self._contact_arena = FieldArena()
         self._storage: StageContacts | None = None  # storage for the contacts of this step
@@ -277,7 +278,7 @@ class StageSystem:
 
     def _begin(self, stage: Stage, kind: int) -> None:
         self.stage, self.kind, self._nonlinear_kind, self.r_scale, self.contacts = stage, kind, kind, 1.0, NO_CONTACTS
-        self._rejects_direct = False  # whether a direct solve of this stage was rejected: others would be, too
+        self._rejects_direct = False
         self.floor, self.unbalanced = self.rounding.of_stage(stage.c, stage.beta), (0.0, "")
         if self.pieces.several:
             self.pieces.forget_weights()
@@ -504,6 +505,7 @@ class StageSystem:
         """Form the matrix at the present state, without J^T D J, which the linear solve adds."""
         self.form(projected, self.stage.c or self._proximal(), self.stage.beta)
         self._same_matrix = False
+        self._rejects_direct &= not projected  # for an indefinite matrix it was
         if self.contacts.any:
             save_diagonal(self.model, self.matrix, self.contacts)
 

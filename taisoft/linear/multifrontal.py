@@ -131,12 +131,12 @@ class Multifrontal:
         found[self.order] = x
         return found
 
-    def solve(self, right: np.ndarray) -> np.ndarray:
-        """Return A^-1 times a right side (n)."""
-        x = right[self.order]
+    def halfway(self, right: np.ndarray) -> np.ndarray:
+        """Return L^-1 times a right side (n), in the order of elimination; `backward` of it is A^-1 times that."""
+        y = right[self.order]
         for part in self.parts:
-            self.forward(part, x[self.unknowns_of(part), None])
-        return self.backward(x)
+            self.forward(part, y[self.unknowns_of(part), None])
+        return y
 
 
 def _minimum_degree(start: np.ndarray, column: np.ndarray) -> np.ndarray:

@@ -45,7 +45,8 @@ class LiveRun:
         self.sim, self.paused, self.speed = sim, paused, speed
         self.problem, self._note = "", Note(note)
         self._window, self._controls = window, Controls(sim)
-        self._own_budget, self._is_budgeted, self._sending = sim.settings.budget, budget, 0.0  # the last: a state [s]
+        self._own_budget, self._sending = sim.settings.budget, 0.0  # the latter: a state [s]
+        self._is_budgeted = budget or self._own_budget is not None
         self._last_speed = 1.0  # before it was unbound
         self._compiled = False  # True after a step, since that compiles everything
         self._published = -math.inf  # wall time of the last published state
@@ -106,13 +107,15 @@ class LiveRun:
     def _budget(self) -> float | None:
         """Return the wall time of the next step [s], see above; None: any."""
         is_due = self._compiled and not (self.paused or math.isinf(self.speed))
-        if not (self._is_budgeted and is_due and self.sim.settings.tolerance is None):
+        if not self._is_budgeted or self._own_budget is not None:
+            return self._own_budget if self._is_budgeted else None
+        if not (is_due and self.sim.settings.tolerance is None):
             return None
         due = self.sim.dt / self.speed
         return max(LEAST_SHARE * due, SHARE * due - self._sending * min(1.0, due / BATCH))
 
     def _take(self, n: int) -> None:
-        self.sim.budget = self._budget() if self._own_budget is None else self._own_budget
+        self.sim.budget = self._budget()
         timed_advance(self.sim, n, self._after_step)
         if not self._compiled:
             self._compiled = True
@@ -186,9 +189,7 @@ class LiveRun:
         self._set_speed(self._last_speed if math.isinf(self.speed) else math.inf)
 
     def _on_budget(self) -> None:
-        if self._own_budget is None:
-            self._is_budgeted = not self._is_budgeted
-        self._own_budget = None
+        self._is_budgeted = not self._is_budgeted
 
     def _set_speed(self, speed: float) -> None:
         if not math.isinf(self.speed):
@@ -259,7 +260,7 @@ class LiveRun:
             "paused": self.paused,
             "asked_speed": None if math.isinf(self.speed) else self.speed,
             "status": self._status(),
-            "budget": self._is_budgeted if self._own_budget is None else True,
+            "budget": self._is_budgeted,
             "messages": [*([self.problem] if self.problem else []), *self._note.shown],
             "drag_done": self._drag_done,
             **self._measured,

@@ -16,9 +16,11 @@ import pytest
 import taisoft as ts
 from taisoft.dynamics.direct import DirectSolver
 from taisoft.dynamics.dynamics import Dynamics
+from taisoft.dynamics.friction import Goal, Solution
 from taisoft.dynamics.frictional_problems import FrictionalProblems
 from taisoft.dynamics.renewal import Renewal
 from taisoft.dynamics.schemes import SCHEMES
+from taisoft.dynamics.stage import Stage
 from taisoft.dynamics.stage_system import StageSystem
 from taisoft.linear.multifrontal import Multifrontal
 from tests.collision.rotations import rotation
@@ -123,6 +125,30 @@ def test_linearised_steps_move_as_with_iterations(soft, monkeypatch):
 def test_a_rigid_cube_on_a_soft_one_moves_as_with_iterations(patience):
     with opened(rigid_on_soft(), "implicit_euler", 0.004, **TIGHT) as sim:
         assert_same_motion(sim, patience)
+
+
+def test_patterns_of_large_meshes_are_not_analysed(soft, monkeypatch):
+    """Which takes seconds, and memory."""
+    monkeypatch.setattr(DirectSolver, "MOST_NODES", 1)
+    monkeypatch.setattr(DirectSolver, "_analyse", lambda _self: pytest.fail("it was analysed"))
+    with direct() as found:
+        run(soft, 2)
+    assert not found
+
+
+def test_iterations_are_tried_again_now_and_then(soft, monkeypatch):
+    """By the first problem of a stage, whatever the number of problems in one."""
+    goal = Goal(norm=1.0, law=1.0, inner=1.0, forcing=0.1)
+    for n_problems in (1, 2, 3):
+        monkeypatch.setattr(soft.stepper.solver, "n_direct", 0)
+        tried = 0
+        for _ in range(100):
+            problems = FrictionalProblems(soft.stepper.solver, Stage(1.0, 0.01, 0.01, 1e-8))
+            for _ in range(n_problems):
+                tried += not problems.is_direct
+                problems.count(goal, Solution(1 if problems.is_direct else 9, 0, 0, False, True, 0.0, direct=True))
+        most = 100 * n_problems / FrictionalProblems.TRIAL
+        assert 0.7 * most <= tried <= most + 2
 
 
 def refuse(patch: pytest.MonkeyPatch) -> None:

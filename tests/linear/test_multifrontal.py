@@ -106,7 +106,7 @@ def test_it_solves(pattern):
     assert np.array_equal(factor.order[factor.place], np.arange(pattern.size))
     for b in rights(pattern, 3).T:
         given = b.copy()
-        assert_close(factor.solve(b), np.linalg.solve(A, b))
+        assert_close(factor.backward(factor.halfway(b)), np.linalg.solve(A, b))
         assert np.array_equal(b, given)
 
 
@@ -146,7 +146,8 @@ def test_one_factor_serves_many_matrices(pattern):
     for seed in (2, 3, 2):
         A = pattern.matrix(seed)
         pattern.factorise(factor, A)
-        assert np.array_equal(factor.solve(b), factorised(pattern, A).solve(b))
+        other = factorised(pattern, A)
+        assert np.array_equal(factor.backward(factor.halfway(b)), other.backward(other.halfway(b)))
         A[-1, -1] *= -1.0
         with pytest.raises(np.linalg.LinAlgError, match="not positive definite"):
             pattern.factorise(factor, A)
@@ -191,4 +192,4 @@ def test_merging_fronts_does_not_change_solutions(pattern, monkeypatch):
         assert apart > 10
     expected = np.linalg.solve(A, b)
     for factor in factors:
-        assert_close(factor.solve(b), expected)
+        assert_close(factor.backward(factor.halfway(b)), expected)

@@ -168,10 +168,11 @@ def test_an_implicit_step_gets_a_budget_of_the_time_in_which_it_is_due(live):
     assert sim.budget is None, "single steps are solved to their end"
     own = Clock(0.01, 1e-3, "implicit_euler")
     own.settings = Settings(budget=0.5)
-    run, _ = live(own)
-    own.now += 0.02
-    run.turn()
-    assert own.budget == 0.5 and run.panel_state()["budget"]
+    run, window = live(own, {1: [["budget"]], 2: [["budget"]]})
+    for turn in range(3):
+        own.now += 0.02
+        run.turn()
+        assert own.budget == (None if turn == 1 else 0.5) and run.panel_state()["budget"] == (turn != 1)
     run, _ = live(Clock(0.01, 1e-3, "implicit_euler"), budget=False)
     run.sim.now += 0.02
     run.turn()
