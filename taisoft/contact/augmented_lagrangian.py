@@ -46,9 +46,8 @@ def prox(z: np.ndarray, friction: np.ndarray) -> np.ndarray:
     return np.column_stack([normal, scale * z[:, 1], scale * z[:, 2]])
 
 
-def natural_map(W, b: np.ndarray, friction: np.ndarray, factor: np.ndarray, r: np.ndarray) -> np.ndarray:
-    """r - prox(r - f (W r + b)), (k,3)."""
-    u = (W @ r.ravel() + b).reshape(-1, 3)
+def natural_map(u: np.ndarray, friction: np.ndarray, factor: np.ndarray, r: np.ndarray) -> np.ndarray:
+    """r - prox(r - f u) at velocities u (k,3), (k,3)."""
     return r - prox(r - factor[:, [0, 1, 1]] * u, friction)
 
 
@@ -59,8 +58,12 @@ def relative(changed: float, size: float) -> float:
 
 def find_residual(W, b: np.ndarray, friction: np.ndarray, r: np.ndarray, factor: np.ndarray | None = None) -> float:
     """|r - prox(r - f (W r + b))| / |r|. factor: f (k,2), by default `find_factors` of W."""
-    f = find_factors(W) if factor is None else factor
-    return float(relative(np.linalg.norm(natural_map(W, b, friction, f, r)), np.linalg.norm(r)))
+    return residual_at((W @ r.ravel() + b).reshape(-1, 3), friction, find_factors(W) if factor is None else factor, r)
+
+
+def residual_at(u: np.ndarray, friction: np.ndarray, factor: np.ndarray, r: np.ndarray) -> float:
+    """|r - prox(r - f u)| / |r| at velocities u (k,3)."""
+    return float(relative(np.linalg.norm(natural_map(u, friction, factor, r)), np.linalg.norm(r)))
 
 
 # --- the method -------------------------------------------------------------------------------------------------------
@@ -88,7 +91,8 @@ class _Island:
 
     def take(self, r: np.ndarray) -> None:
         self.r, self.size = r, float(np.linalg.norm(r))
-        self.changed = float(np.linalg.norm(natural_map(self.W, self.b, self.friction, self.factor, r)))
+        u = (self.W @ r.ravel() + self.b).reshape(-1, 3)
+        self.changed = float(np.linalg.norm(natural_map(u, self.friction, self.factor, r)))
 
 
 def solve(

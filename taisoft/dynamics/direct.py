@@ -124,12 +124,14 @@ class DirectSolver:
         self._values = values
         self._factor.factorise(values, self._places)
 
-    def _find_rows(self, k: StageContacts) -> None:
-        """Find the rows of J (entries, axes of the contact, of the node), 0 for tangents without friction."""
-        p = k.problem
-        contact, node, weight = read_entries(p)
-        J = frames(p)
-        J[download([p.friction], len(J))[0] == 0.0, 1:] = 0.0
+    def _find_rows(self, entries: tuple, axes: np.ndarray, friction: np.ndarray) -> None:
+        """Find the rows of J (entries, axes of the contact, of the node), 0 for tangents without friction.
+
+        entries: of the contacts, see `read_entries`; axes: their `frames`; friction: (k,).
+        """
+        contact, node, weight = entries
+        J = axes.copy()
+        J[friction == 0.0, 1:] = 0.0
         node = self._number[node]
         self._J = contact, node, weight[:, None, None] * J[contact] * self._free[node][:, None, :]
 
@@ -180,9 +182,10 @@ class DirectSolver:
         x, v, residual = download([m.state.x, m.state.v, k.residual_linear])
         residual = (self._free * residual.astype(np.float64)[self._nodes]).reshape(-1)
         y = self._factor.halfway(residual)
-        self._find_rows(k)
-        start = self._velocities(k, x, beta)
         friction, factor, r = download([p.friction, p.factor, k.work.kept], n)
+        entries, axes = read_entries(p), frames(p)
+        self._find_rows(entries, axes, friction)
+        start = self._velocities(k, entries, axes, x, beta)
         active, iterations = (r[:, 0] > 0.0) | (start[:, 0] < 0.0), 0
         for _ in range(self.ROUNDS):
             r, change, n_iterations = self._solve_active(active, start, y, r, friction, factor, tolerance)
@@ -191,10 +194,7 @@ class DirectSolver:
             if not (closes := ~active & (u[:, 0] < 0.0)).any():
                 break
             active |= closes
-        z = r - factor[:, [0, 1, 1]] * u
-        law_residual = augmented_lagrangian.relative(
-            np.linalg.norm(r - augmented_lagrangian.prox(z, friction)), np.linalg.norm(r)
-        )
+        law_residual = augmented_lagrangian.residual_at(u, friction, factor, r)
         if not (self.is_rigid or law_residual <= acceptable):  # also if it is not a number
             return None
         impulses = p.r.to_numpy()
@@ -247,15 +247,14 @@ class DirectSolver:
         np.subtract.at(left, node, np.einsum("eij,ei->ej", J, r[contact]))
         return float(np.linalg.norm(left))
 
-    def _velocities(self, k: StageContacts, x: np.ndarray, beta: float) -> np.ndarray:
-        """u (k,3) at positions x (n_nodes,3), see `contact_terms.stage_velocity_of`."""
-        n = int(k.problem.count[0])
-        gap, offset = download([k.work.gap_minus_target, k.work.tangential_offset], n)
-        contact, node, weight = read_entries(k.problem)
-        moved = np.zeros((n, 3))
+    def _velocities(self, k: StageContacts, entries: tuple, axes: np.ndarray, x: np.ndarray, beta: float) -> np.ndarray:
+        """u (k,3) at positions x (n_nodes,3), see `contact_terms.stage_velocity_of`. entries, axes: as for `_find_rows`."""
+        gap, offset = download([k.work.gap_minus_target, k.work.tangential_offset], len(axes))
+        contact, node, weight = entries
+        moved = np.zeros((len(axes), 3))
         np.add.at(moved, contact, weight[:, None] * (x - k.x_start.to_numpy())[node])
-        u = np.einsum("kij,kj->ki", frames(k.problem), moved + offset)
-        u[:, 0] = gap + np.einsum("kj,kj->k", k.problem.normal.to_numpy(n), moved)
+        u = np.einsum("kij,kj->ki", axes, moved + offset)
+        u[:, 0] = gap + np.einsum("kj,kj->k", axes[:, 0], moved)
         return u / beta
 
     @property
