@@ -150,6 +150,7 @@ def set_contact(
     with thawed(self.scene):
         self.scene.set_contact(name_a, name_b, friction=friction, restitution=restitution)
     dynamics.changes += 1
+    dynamics.stepper.wake()
     if dynamics.contact is not None:
         dynamics.contact.numbers_changed()
 

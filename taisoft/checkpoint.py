@@ -27,12 +27,12 @@ from taisoft.scene.checks import instance
 from taisoft.scene.fingerprint import FEATURES, digest, scene_fingerprint
 from taisoft.scene.numbers import Numbers, first_difference, scene_numbers, set_numbers
 from taisoft.scene.scene import Scene
-from taisoft.settings import NAMES, plan_of
+from taisoft.settings import NAMES, Settings, plan_of
 
 if TYPE_CHECKING:
     from taisoft.simulator import Simulator
 
-KIND, FORMAT = "taisoft checkpoint", 24  # increment FORMAT with every change of a file's content
+KIND, FORMAT = "taisoft checkpoint", 25  # increment FORMAT with every change of a file's content
 PARTS = ("settings", "numbers", "start", "fingerprint", "state", "notes")  # of the header, each a table
 
 
@@ -230,7 +230,8 @@ def from_checkpoint(cls: type["Simulator"], saved: Checkpoint, scene: Scene, arc
     settings = saved.settings | ({} if arch is None else {"arch": arch})
     if set(settings) != set(NAMES):
         raise SimulationError(f"{saved.path} holds no state of this scene: its settings are not those of this version")
-    check_scene(saved, scene, plan_of(scene, *(settings[key] for key in ("integrator", "self_collision", "draggable"))).on)
+    own = Settings(**settings)
+    check_scene(saved, scene, plan_of(scene, own.integrator, own.self_collision, own.draggable, own.sleeps).on)
     present, sim = scene.snapshot(scene), None
     present.allow_initial_overlap = True  # bodies move to the saved positions below
     try:

@@ -235,6 +235,11 @@ def draggable(self: "Simulator") -> bool:
     return self.settings.draggable
 
 
+def asleep(self: "Simulator") -> list[str]:
+    """Names of the bodies that sleep: the next step leaves them out unless something wakes them."""
+    return self._host().asleep
+
+
 def dragged(self: "Simulator") -> Drag | None:
     """The present drag, with its point [m] and force [N] at the start of the last step; None if nothing is dragged."""
     spring = self._dynamics.drag_spring

@@ -37,11 +37,17 @@ class Settings:
     tolerance: float | None = None  # of a run's positions, over the largest excursion
     ramp: float | None = None  # [s] in which constant loads and gravity grow from 0; of statics only
     budget: float | None = None  # [s] of wall time for an implicit step in time
+    sleep: bool = True  # whether implicit steps leave out bodies at rest; not with a tolerance
 
     @property
     def explicit(self) -> bool:
         """Whether the integrator is explicit."""
         return self.integrator in EXPLICIT
+
+    @property
+    def sleeps(self) -> bool:
+        """Whether bodies may sleep where the integrator and the scene allow it."""
+        return self.sleep and self.tolerance is None
 
     @property
     def static(self) -> bool:
@@ -82,9 +88,9 @@ def refuse_robots(scene: Scene, what: str) -> None:
         raise SimulationError(f"{what}: the motion of robot {robot.name!r} depends on forces and is not known ahead")
 
 
-def plan_of(scene: Scene, integrator: str, self_collision: bool, draggable: bool) -> Plan:
+def plan_of(scene: Scene, integrator: str, self_collision: bool, draggable: bool, sleep: bool = True) -> Plan:
     """Return the plan of a scene under an integrator, with the laws and the damping that its rigid bodies take on in a run."""
-    plan = make_plan(scene.snapshot(), integrator in EXPLICIT, is_multistep(integrator), self_collision, draggable)
+    plan = make_plan(scene.snapshot(), integrator in EXPLICIT, is_multistep(integrator), self_collision, draggable, sleep)
     return plan.without_rates() if integrator == STATIC else plan
 
 

@@ -38,6 +38,8 @@ class Simulator(Guarded):
     budget: wall time for an implicit step in time [s]. Where it is used up Newton's method ends at its last iterate, after one
     iteration at least; bodies that would then pass through something, or invert, are held back. Such steps are reported as not
     converged (`StepReport.on_budget`). Results then depend on the machine and its load.
+    sleep: leave bodies that rest out of implicit steps until something moves them, see `taisoft.dynamics.sleeping`; never with a
+    tolerance.
     An explicit integrator refuses a dt above `stable_dt`; with allow_unstable it only warns.
     Raises SceneError for a scene that cannot be simulated, SimulationError for settings that cannot be met.
     """
@@ -66,6 +68,7 @@ class Simulator(Guarded):
         tolerance: float | None = None,
         ramp: float | None = None,
         budget: float | None = None,
+        sleep: bool = True,
     ):
         given = locals()  # of the arguments alone, as long as this is the first line
         self.settings = check_settings(scene, **{name: given[name] for name in NAMES})
@@ -77,7 +80,7 @@ class Simulator(Guarded):
         changes.check_stability(self, self.settings.dt)
         for text in scale_warnings(scene):
             warnings.warn(text, UserWarning, stacklevel=2)
-        self.plan = plan_of(self._start_scene, self.settings.integrator, self_collision, draggable)
+        self.plan = plan_of(self._start_scene, self.settings.integrator, self_collision, draggable, self.settings.sleeps)
         laws = {law for body in scene.bodies for law in body.composition.laws}
         self._may_soften = any(lane_law(law).SOFTENS_BELOW for law in laws)  # until a warning says so
         self._compiled_before = self._compile_reported = runtime.compile_clock()
@@ -186,6 +189,7 @@ class Simulator(Guarded):
     nodal_errors = queries.nodal_errors
     draggable = property(queries.draggable)
     dragged = property(queries.dragged)
+    asleep = property(queries.asleep)
     picture = queries.picture
     compile_seconds = property(queries.compile_seconds)
     field_bytes = property(queries.field_bytes)

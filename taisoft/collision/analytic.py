@@ -233,7 +233,7 @@ def _obstacle_contacts(s: ti.template(), o: ti.template(), t, k, margin, out: ti
 
 @kernel(cse=False)
 def find_analytic(s: ti.template(), o: ti.template(), margin: ti.f64, out: ti.template(), append: ti.i32):
-    """Write contacts of the soft bodies' triangles with all analytic obstacles that these are not attached to.
+    """Write contacts of the soft bodies' triangles with all analytic obstacles that these are not attached to, unless both rest.
 
     They are appended if `append` is 1.
     """
@@ -245,6 +245,8 @@ def find_analytic(s: ti.template(), o: ti.template(), margin: ti.f64, out: ti.te
             for t in range(part_first(c, s.n_triangles, s.chunks), part_first(c + 1, s.n_triangles, s.chunks)):
                 if s.soft[s.body[t]] == 1 and (s.lo[t] <= s.hi[t]).all():
                     for k in range(o.count):
+                        if s.rests[s.body[t]] & s.rests[o.body[k]]:
+                            continue
                         if ti.static(s.has_attached):
                             if s.attached[s.body[t] * s.n_bodies + o.body[k]] == 1:
                                 continue

@@ -286,6 +286,13 @@ class Detection:
             self._fields.unmapped[0] = unmapped
         return end
 
+    def let_rest(self, colliders: np.ndarray) -> bool:
+        """Let colliders (n,) bool rest from now on, and no others: they are not tested against each other. Return whether some
+        have rested that do not any more."""
+        rested = self.surface.rests.to_numpy(len(colliders)) > 0
+        self.surface.rests.from_numpy(colliders.astype(np.int32), 0)
+        return bool((rested & ~colliders).any())
+
     # --- results --------------------------------------------------------------------------------------------------
 
     def contacts(self) -> Contacts:

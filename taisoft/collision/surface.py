@@ -54,6 +54,7 @@ class Surface:
     around: Any
     soft: Any  # (n_bodies) i32: 1 for soft bodies
     self_on: Any  # (n_bodies) i32: 1 if a body is tested against itself
+    rests: Any  # (n_bodies) i32: 1 for colliders that rest: those are not tested against each other
     attached: Any  # (n_bodies^2) i32: 1 for pairs that are not tested, since they are attached to each other; None: no pair is
     mode: Any  # (n_bodies) i32: contact mode, see `features`
     thickness: Any  # (n_bodies) f64: thickness [m], inf for half-spaces
@@ -111,6 +112,7 @@ def build_surface(
     vectors = dict.fromkeys(("x", "move"), v) | dict.fromkeys(("lo", "hi", "normal"), n)
     vectors |= dict.fromkeys(("body_lo", "body_hi"), bodies)
     zeros = {"active": n, "active_of_chunk": n, "count": 4, "part": chunks, "near": chunks * bodies, "sharp": n, "inside": v}
+    zeros |= {"rests": bodies}
     # triangles are rows, not vectors: the compiler confuses run-time and fixed component indices within one kernel
     fields = {name: integers(arena, f"surface_{name}", data) for name, data in tables.items()}
     fields |= {name: arena.vectors(f"surface_{name}", ti.f64, max(count, 1)) for name, count in vectors.items()}
@@ -247,9 +249,11 @@ def _box_bodies(surface: ti.template()):
 
 @ti.func
 def may_meet(s: ti.template(), a, b):
-    """1 if colliders a and b may touch and their boxes overlap, or if a is b and is tested against itself."""
+    """1 if colliders a and b may touch and their boxes overlap, or if a is b and is tested against itself; not if both rest."""
     accepted = 0
-    if a == b:
+    if s.rests[a] & s.rests[b]:
+        accepted = 0
+    elif a == b:
         accepted = s.self_on[a]
     elif s.soft[a] | s.soft[b]:
         accepted = int((s.body_lo[a] <= s.body_hi[b]).all()) & int((s.body_lo[b] <= s.body_hi[a]).all())

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import taichi as ti
 
-from taisoft.backend.arrays import FieldArena, upload
+from taisoft.backend.arrays import FieldArena, download, upload
 from taisoft.collision.contacts import Contacts
 from taisoft.collision.detector import Detection
 from taisoft.collision.intersections import CROSSED
@@ -28,6 +28,7 @@ from taisoft.contact.build import (
     upload_pair_numbers,
 )
 from taisoft.contact.problem import build_node_problem, index_nodes
+from taisoft.dynamics.asleep import AsleepContacts, Rows, Sides, join, select
 from taisoft.dynamics.contact_measures import DEEP_PENETRATION, DEPTH, RELATIVE_PENETRATION, ContactMeasures, Crossing
 from taisoft.dynamics.contact_paths import ContactPaths
 from taisoft.dynamics.far_apart import FarApart
@@ -37,10 +38,13 @@ from taisoft.dynamics.readout import (
     MORE_ROWS,
     ContactRows,
     Pairs,
+    join_contacts,
+    join_sides,
     nodal_impulses,
     offsets_of,
     read_contacts,
     read_rows,
+    slip_velocities,
     sum_on,
     sum_pairs,
     write_rows,
@@ -101,6 +105,7 @@ class ContactStep:
         self.rebounds = Rebounds(simulation, self._lasting)
         simulation.now.slip = self._lasting.field("accumulated_slip", ti.f64, model.n_nodes)
         self._surface_loads = SurfaceLoads(simulation)
+        self._asleep: AsleepContacts | None = None  # those of sleeping bodies, which `problem` lacks
         self._searched: tuple[float, float] | None = None  # time and dt of the valid search
         self._measured_end: tuple[float, float] | None = None  # time and dt of the measured end, until the next substep begins
         self._depth = 0.0  # deepest penetration there [m]
@@ -147,8 +152,13 @@ class ContactStep:
 
     @property
     def n_contacts(self) -> int:
-        """Contacts of the last step, including those without impulse."""
+        """Contacts of the last step, including those without impulse, but not those of sleeping bodies."""
         return int(self.problem.count[0])
+
+    @property
+    def n_asleep(self) -> int:
+        """Contacts of sleeping bodies."""
+        return 0 if self._asleep is None else len(self._asleep)
 
     def forget(self) -> None:
         """Discard all that is known of a state and its past, after another one was set."""
@@ -162,7 +172,7 @@ class ContactStep:
         self.discard_search(with_impulses=True)
         self.penetration = self.relative_penetration = self._step_dt = 0.0
         self._pairs, self.last_crossing, self.crossing = None, Crossing(), 0.0 if now.none_cross else None
-        now.held = NO_PASSAGES
+        now.held, self._asleep = NO_PASSAGES, None
         self.misplaced.start_step()
         self.paths.forget()
 
@@ -194,6 +204,8 @@ class ContactStep:
             "unmapped": self._search_counts[1],
             "rows": read_rows(self.problem),
             "sides": list(self._renewal.sides or ()),
+            "asleep": {} if self._asleep is None else self._asleep.rows,
+            "asleep_sides": [] if self._asleep is None else list(self._asleep.sides or ()),
         }
 
     def restore(self, kept: dict) -> None:
@@ -209,6 +221,7 @@ class ContactStep:
         self._search_counts = int(kept["found"]), int(kept["unmapped"])
         self.paths.forget()
         self._renewal.sides = tuple(kept["sides"]) or None
+        self._asleep = AsleepContacts(kept["asleep"], tuple(kept["asleep_sides"]) or None) if kept["asleep"] else None
         self.misplaced.start_step()
         self.crossing, self.last_crossing = 0.0 if self.paths.none_cross else None, Crossing()
         self._searched = self._measured_end = None
@@ -244,6 +257,15 @@ class ContactStep:
             self._find(time, dt, prescribed=simulation.prescribed_moves(time + dt))
             self._searched = time, dt
         return detection.counts.contacts
+
+    def search_all(self, time: float, dt: float) -> None:
+        """Do as `search`, among sleeping bodies, too; then the next step searches again."""
+        rests = self.detection.surface.rests.to_numpy() > 0
+        if rests.any():
+            self.let_rest(np.zeros_like(rests))
+        self.search(time, dt)
+        if rests.any():
+            self.let_rest(rests)
 
     def is_far(self, time: float, dt: float) -> bool:
         """Return whether nothing can touch in an explicit step of dt from a time, see `far_apart`: it needs no search."""
@@ -390,8 +412,53 @@ class ContactStep:
         """Time [s] in which the impulses of the last substep acted."""
         return self._last_time / self._impulse_fraction
 
+    def touching(self, colliders: np.ndarray, pressing: bool = False) -> np.ndarray:
+        """Return those of some colliders (n,) bool that have contacts in the last search, or with `pressing` impulses in the last
+        substep."""
+        if pressing:
+            body, r = download([self.problem.body, self.problem.r], self.n_contacts)
+            body = body[r[:, 0] > 0.0]
+        else:
+            body = self.detection.buffer.data.body[self.detection.kept.to_numpy(self.detection.counts.contacts)]
+        return colliders & np.isin(np.arange(len(colliders)), body)
+
+    def let_rest(self, colliders: np.ndarray) -> None:
+        """Search no contacts among colliders (n,) bool from now on, but all others."""
+        self._searched = self._measured_end = None
+        if self.detection.let_rest(colliders):
+            self.paths.forget()  # lists of near pairs lack those
+
+    def set_aside(self, bodies: np.ndarray) -> None:
+        """Take the contacts of bodies, of colliders (n,) bool, out of the problem: they fall asleep."""
+        rows, sides = read_rows(self.problem), self._renewal.sides
+        chosen = bodies[rows["body"]].any(axis=1)
+        self._asleep = AsleepContacts.taken(rows, sides, chosen, self._last_time).joined(self._asleep)
+        self._put(select(rows, ~chosen), sides and tuple(side[~chosen] for side in sides))
+
+    def take_back(self, bodies: np.ndarray) -> None:
+        """Put the contacts of bodies, of colliders (n,) bool, into the problem again: they wake."""
+        if self._asleep is None:
+            return
+        taken, left = self._asleep.split(bodies[self._asleep.rows["body"]].any(axis=1))
+        self._asleep, sides = left if len(left) else None, self._renewal.sides
+        self._put(join(read_rows(self.problem), taken.after(self._last_time)), sides and join_sides(sides, taken.sides))
+
+    def _put(self, rows: Rows, sides: Sides | None) -> None:
+        """Replace the contacts of the problem, whose impulses act as long as those of the last substep."""
+        if room := self._room(len(rows["gap"]), len(rows["node"])):
+            last_time = self._last_time
+            self._allocate(*room)
+            self._last_time = last_time
+        write_rows(self.problem, rows)
+        self._renewal.sides, self._indexed = sides, True  # so that the next step updates the node index
+
     def rows(self, own: bool = False) -> ContactRows:
-        """Return the contacts of the last substep. own: with the nodes before dependent ones were replaced, if they are known."""
+        """Return the contacts of the last substep, with those of sleeping bodies; see `awake`."""
+        found = self.awake(own)
+        return found if self._asleep is None else join_contacts(found, self._asleep.contacts(self.duration, own))
+
+    def awake(self, own: bool = False) -> ContactRows:
+        """Return the contacts of the problem. own: with the nodes before dependent ones were replaced, if they are known."""
         found = read_contacts(self.problem, self._impulse_fraction)
         if not own or self._renewal.sides is None:
             return found
@@ -400,7 +467,10 @@ class ContactStep:
 
     def _sum_pairs(self) -> Pairs:
         """Add the last substep's contacts to the sums of earlier substeps."""
-        return sum_pairs(self.problem, self.rows(own=True), self.duration, *self.simulation.state(), self._pairs)
+        (x, v), before = self.simulation.state(), self._pairs
+        if before is None and self._asleep is not None:
+            before = self._asleep.pairs(self._step_dt, x)
+        return sum_pairs(self.awake(own=True), slip_velocities(self.problem, v, self.duration), x, before)
 
     def pairs(self) -> Pairs:
         """Return the sums over the contacts of each pair in the last step, see `sum_pairs`."""

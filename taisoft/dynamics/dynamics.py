@@ -70,6 +70,7 @@ class Dynamics:
         model, layout = build_model(scene, self.runtime, self.arena, plan.on)
         self.state = SimulationState(scene, self.runtime, self.arena, model, layout, DirichletConditions(scene, layout))
         self.state.ramp, self.state.budget = settings.ramp or 0.0, settings.budget
+        self.state.asleep = np.zeros(model.n_nodes, dtype=bool) if plan.on["sleeping"] else None
         self.contact = None
         if plan.on["contact_forces"]:
             from taisoft.dynamics.contact import ContactStep
@@ -156,7 +157,7 @@ class Dynamics:
         report.min_volume_ratio = min(result.min_volume_ratio, lowest)
         report.n_inverted = max(result.n_inverted, inverted)
         if (contact := self.contact) is not None:
-            report.n_contacts, report.max_penetration = contact.n_contacts, contact.penetration
+            report.n_contacts, report.max_penetration = contact.n_contacts + contact.n_asleep, contact.penetration
             report.dropped_contacts, report.deep = contact.dropped, int(contact.is_deep)
             report.crossings = contact.last_crossing.n_pairs
             report.misplaced, report.contact_error = contact.misplaced.part, contact.misplaced.text
@@ -213,12 +214,14 @@ class Dynamics:
         self.changes += 1
         self.state.loads_changed()
         self.stepper.loads_changed()
+        self.stepper.wake()
 
     def set_dt(self, dt: float) -> None:
         """Set dt [s] of the next step."""
         self._time_base = self.state.time, self.state.step_count
         self.changes += 1
         self.dt = dt
+        self.stepper.wake()
 
     def command(self, commands: dict[int, Command]) -> None:
         """Let movers of `commands` follow others from the next step on."""
@@ -242,6 +245,12 @@ class Dynamics:
         if self.drag_spring is not None and self.drag_spring.release():
             self.changes += 1
             self.stepper.loads_changed()
+
+    @property
+    def asleep(self) -> list[str]:
+        """The names of the bodies that sleep."""
+        first, asleep = self.state.layout.node_start, self.state.asleep
+        return [] if asleep is None else [body.name for k, body in enumerate(self.scene.bodies) if asleep[first[k]]]
 
     @property
     def is_driven(self) -> bool:
@@ -307,7 +316,7 @@ class Dynamics:
         """Detect the contacts of the present state swept by dt [s]; with 0, paths are evaluated at the present time only."""
         state = self.state
         if self.contact is not None:
-            self.contact.search(state.time, dt)
+            self.contact.search_all(state.time, dt)
             return self.contact.detection
         if self._idle_detection is None:
             from taisoft.collision.detector import Detection

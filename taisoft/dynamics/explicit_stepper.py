@@ -151,6 +151,9 @@ class ExplicitStepper:
         both = {"acceleration": self.work.acceleration, "reaction": self.work.reaction}
         return {name: field for name, field in both.items() if field is not None}
 
+    def wake(self) -> None:
+        """Do nothing: nothing sleeps in explicit steps."""
+
     def snapshot(self) -> dict:
         """Return the state of the stepper, including the reactions.
 

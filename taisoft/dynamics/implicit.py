@@ -23,6 +23,7 @@ from taisoft.dynamics.no_contacts import NoContacts
 from taisoft.dynamics.part_length import PARTS, PartLength
 from taisoft.dynamics.results import StageResult, StepResult, count_all, merge
 from taisoft.dynamics.simulation_state import SimulationState
+from taisoft.dynamics.sleeping import Sleep
 from taisoft.errors import SimulationError
 from taisoft.fem.measure import measure
 from taisoft.fem.state import N_INVERTED
@@ -39,21 +40,47 @@ class ImplicitStepper(ImplicitStages):
         super().__init__(simulation, settings, contact)
         self.first = simulation.now.another(simulation.arena, "first")  # state before the step
         self.reached, self.last = 0.0, None  # fraction of the last step until which all parts converged; its result
+        self.sleep = None if simulation.asleep is None else Sleep(simulation, contact, self.tolerance)
         self.forget()
 
     def forget(self) -> None:
         """Discard the history, after the state was set."""
         super().forget()
         self._length = PartLength()
+        if self.sleep is not None:
+            self.sleep.forget()
+
+    def wake(self) -> None:
+        """Wake all bodies that sleep."""
+        if self.sleep is not None:
+            self.sleep.wake_all()
+
+    def numbers_changed(self) -> None:
+        """Update for changed gravity or material numbers."""
+        super().numbers_changed()
+        self.wake()
+
+    def loads_changed(self) -> None:
+        """Wake what is dragged: every stage reads the loads."""
+        if self.sleep is not None and self.simulation.drag is not None:
+            self.sleep.keep_awake(self.simulation.drag[0])
+
+    def reactions(self) -> np.ndarray:
+        """Return the constraint forces of the last step, (n_nodes, 3) [N]."""
+        found = super().reactions()
+        return found if self.sleep is None else self.sleep.reactions(found)
 
     def snapshot(self) -> dict:
         """Return the state of the stepper: history, solver, contacts, and the length of the next part."""
-        return super().snapshot() | {"part_length": self._length.snapshot()}
+        sleep = {} if self.sleep is None else {"sleep": self.sleep.snapshot()}
+        return super().snapshot() | {"part_length": self._length.snapshot()} | sleep
 
     def restore(self, kept: dict) -> None:
         """Restore a `snapshot`."""
         super().restore(kept)
         self._length.restore(kept["part_length"])
+        if self.sleep is not None:
+            self.sleep.restore(kept["sleep"])
 
     def held_steps(self, dt: float) -> int:
         """Return the number of steps of dt over which a drag force is held."""
@@ -61,6 +88,9 @@ class ImplicitStepper(ImplicitStages):
 
     def advance(self, n: int, dt: float) -> StepResult:
         """Take one step of dt, whatever n. Raise SimulationError if it fails; the state is then the one before."""
+        time, sleep = self.simulation.time, self.sleep
+        if sleep is not None and sleep.begin_step(time, dt):
+            return StepResult()
         self.first.copy_from(self.simulation.now)
         self.solver.budget.begin(None if self.scheme.c == 0.0 else self.simulation.budget)
         dropped: list[StageResult] = []
@@ -79,8 +109,16 @@ class ImplicitStepper(ImplicitStages):
                 length.give_up()
         if self._is_over():
             self._length.give_up()
+        if sleep is not None and sleep.is_pressed():
+            self.simulation.return_to(self.first)
+            self.n_previous = 0
+            self.contact.discard_search(with_impulses=self.scheme.before > 0.0)
+            return self.advance(n, dt)
         self.last = merge(kept)
-        return self._report(count_all(self.last, dropped), len(kept), held)
+        step = self._report(count_all(self.last, dropped), len(kept), held)
+        if sleep is not None:
+            sleep.end_step(time + dt, step.converged and not step.problems, self.reactions)
+        return step
 
     def _take_parts(self, dt: float, dropped: list[StageResult]) -> tuple[list[StageResult], float]:
         """Take a step of dt in parts, which are halved while they are rejected, and then in `dropped`. Return the results of the

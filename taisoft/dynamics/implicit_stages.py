@@ -118,9 +118,6 @@ class ImplicitStages:
         """Update for changed gravity or material numbers."""
         self.solver.numbers_changed()
 
-    def loads_changed(self) -> None:
-        """Do nothing: every stage reads the loads."""
-
     def snapshot(self) -> dict:
         """Return the history, and the state of solver and contacts."""
         x, v = download([self.start.x, self.start.v])

@@ -49,32 +49,58 @@ def offsets_of(common: float, within: np.ndarray, guard: np.ndarray) -> np.ndarr
 
 def read_contacts(problem: ContactProblem, impulse_fraction: float) -> ContactRows:
     """Return a problem's contacts with their impulses. impulse_fraction: of a step, in which they act."""
-    rows = read_rows(problem)
+    return rows_of(read_rows(problem), impulse_fraction)
+
+
+def rows_of(rows: dict[str, np.ndarray], impulse_fraction: float, sides: tuple | None = None) -> ContactRows:
+    """Return what `read_rows` has read. sides: nodes and weights (k, 2 w) to be returned instead of those of the rows."""
     normal, tangent, r = rows["normal"], rows["tangent"], rows["r"] / impulse_fraction + rows["impact_impulse"]
     impulse = r[:, :1] * normal + r[:, 1:2] * tangent + r[:, 2:] * np.cross(normal, tangent)
-    nodes, weights = in_columns(*(rows[name] for name in ("arity", "arity_a", "node", "weight")))
-    on_b = slice(weights.shape[1] // 2, None)
-    weights[:, on_b] = 0.0 - weights[:, on_b]
+    if sides is None:
+        nodes, weights = in_columns(*(rows[name] for name in ("arity", "arity_a", "node", "weight")))
+        on_b = slice(weights.shape[1] // 2, None)
+        weights[:, on_b] = 0.0 - weights[:, on_b]
+        sides = nodes, weights
     return ContactRows(
-        *(rows["body"], rows["feature"], rows["point"], normal, rows["gap"], impulse, nodes, weights),
+        *(rows["body"], rows["feature"], rows["point"], normal, rows["gap"], impulse, *sides),
         *(rows["guard"], rows["area"], rows["status"], rows["slip"]),
     )
 
 
-def sum_pairs(
-    problem: ContactProblem, rows: ContactRows, duration: float, x: np.ndarray, v: np.ndarray, before: Pairs | None
-) -> Pairs:
+def join_sides(*found: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Return nodes and weights (k, 2 w) of all contacts, from those of several lists whose w may differ."""
+    joined, width = [], max(nodes.shape[1] // 2 for nodes, _ in found)
+    for parts, none in zip(zip(*found), (-1, 0)):
+        parts = [part.reshape(len(part), 2, part.shape[1] // 2) for part in parts]
+        parts = [np.pad(part, ((0, 0), (0, 0), (0, width - part.shape[2])), constant_values=none) for part in parts]
+        joined.append(np.concatenate(parts).reshape(-1, 2 * width))
+    return tuple(joined)
+
+
+def join_contacts(first: ContactRows, second: ContactRows) -> ContactRows:
+    """Return the contacts of both."""
+    nodes, weights = join_sides(*((one.nodes, one.weights) for one in (first, second)))
+    rest = {name: np.concatenate([values, getattr(second, name)]) for name, values in vars(first).items()
+            if name not in ("nodes", "weights")}  # fmt: skip
+    return ContactRows(nodes=nodes, weights=weights, **rest)
+
+
+def slip_velocities(problem: ContactProblem, v: np.ndarray, duration: float) -> np.ndarray:
+    """Return the velocities (k,3) of sides a relative to sides b [m/s]. v: (n_nodes, 3) [m/s]; duration [s]: of the step."""
+    (contact, node, weight), u = read_entries(problem), np.zeros((problem.count[0], 3))
+    np.add.at(u, contact, weight[:, None] * v[node])
+    return u - problem.obstacle_displacement.to_numpy(len(u)) / duration
+
+
+def sum_pairs(rows: ContactRows, u: np.ndarray, x: np.ndarray, before: Pairs | None) -> Pairs:
     """Return each pair of different colliders that may touch, and sums over their contacts.
 
     IMPULSE: on the first one [N s]; MOMENTS: of what the first and what the second one gets, about the origin [N m s]; SLIP: the
     normal impulse times the tangential velocity of the first relative to the second [N m]; NORMAL: the normal impulse [N s].
 
-    rows: of the problem, with the nodes before dependent ones were replaced; duration [s]: in which impulses acted; x [m],
-    v [m/s]: (n_nodes, 3). before: pairs and sums to be added.
+    rows: with the nodes before dependent ones were replaced; u: (k,3) of `slip_velocities`; x: (n_nodes, 3) [m]. before: pairs
+    and sums to be added.
     """
-    (contact, node, weight), u = read_entries(problem), np.zeros((problem.count[0], 3))
-    np.add.at(u, contact, weight[:, None] * v[node])
-    u -= problem.obstacle_displacement.to_numpy(len(u)) / duration
     normal = (rows.impulse * rows.normal).sum(axis=1, keepdims=True)
     slip = normal * (u - (u * rows.normal).sum(axis=1, keepdims=True) * rows.normal)
     nodes, weights, half = rows.nodes, rows.weights, rows.nodes.shape[1] // 2

@@ -11,6 +11,7 @@ from taisoft.collision.end_search import EndSearch
 from taisoft.contact.build import PairNumbers, drop_vanishing
 from taisoft.contact.problem import ContactProblem, index_nodes
 from taisoft.dynamics.contact_geometry import IN_PLACE, KEPT, REJECTED, STILL, adopt, judge, largest_motion
+from taisoft.dynamics.readout import join_sides
 from taisoft.dynamics.state import copy_values
 from taisoft.fem.model import Model
 
@@ -72,10 +73,5 @@ class Renewal:
         end, (fate,) = self._found, download([problem.renewal.fate], problem.count[0])
         rows = end.reduction.work.kept.to_numpy(n)[problem.renewal.match.to_numpy(n) != REJECTED]
         stay = np.isin(fate, (KEPT, IN_PLACE))
-        new, merged = self._detection.sides(rows, end.buffer.data), []
-        for k, none in enumerate((-1, 0)):
-            parts = [part.reshape(len(part), 2, part.shape[1] // 2) for part in (self.sides[k][: len(stay)][stay], new[k])]
-            width = max(part.shape[2] for part in parts)
-            parts = [np.pad(part, ((0, 0), (0, 0), (0, width - part.shape[2])), constant_values=none) for part in parts]
-            merged.append(np.concatenate(parts).reshape(-1, 2 * width))
-        self.sides = tuple(merged)
+        kept = tuple(side[: len(stay)][stay] for side in self.sides)
+        self.sides = join_sides(kept, self._detection.sides(rows, end.buffer.data))

@@ -46,6 +46,7 @@ class SimulationState:
     drag: tuple[np.ndarray, np.ndarray] | None = None  # nodes (k,) and forces (k, 3) [N] of a drag spring
     ramp: float = 0.0  # [s] from the start, in which constant loads and gravity grow; statics only, as is:
     budget: float | None = None  # wall time of an implicit step in time [s]
+    asleep: np.ndarray | None = None  # (n_nodes,) bool: of bodies that sleep, see `sleeping`; None: none ever does
     at: float | None = None  # [s] when all that follows paths has the values towards which it grows, too; None: it follows them
     _loads: SceneLoads | None = None  # None: not computed, or outdated
     load_time: float | None = None  # of the loads on the device; None: several, or outdated
@@ -130,6 +131,8 @@ class SimulationState:
     def restart(self) -> None:
         """Set the initial state of the scene. From the first reset after a step on, it is kept ready: learning resets often."""
         self.now.released[:] = False
+        if self.asleep is not None:
+            self.asleep[:] = False
         m = self.model
         if m.viscous:
             m.viscosity.history.fill(0.0)
@@ -178,6 +181,8 @@ class SimulationState:
         free = ~self.dirichlet.constrained()
         if self.dependents is not None:
             free[self.dependents.node] = False
+        if self.asleep is not None:
+            free[self.asleep] = False
         upload([(self.model.free, free)])
 
     def upload_gravity(self) -> None:

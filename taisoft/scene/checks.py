@@ -299,6 +299,7 @@ SOLVER_CHECKS = {  # key of the `solver` dict -> check
     "tolerance": _tolerance,
     "ramp": lambda value, what: value is None or _positive(value, what),
     "budget": lambda value, what: value is None or number(value, what, minimum=0.0, unit="s"),
+    "sleep": flag,
     "seconds": _positive,
     "fps": lambda value, what: value is None or _positive(value, what),
     "quantities": _named_quantities,

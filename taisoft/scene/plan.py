@@ -20,7 +20,7 @@ from taisoft.scene.obstacles import Box, MeshObstacle
 from taisoft.scene.rigid import RigidBody
 from taisoft.scene.scene import Scene
 
-OF_RATES = ("mass_damping", "stiffness_damping", "spring_damping", "rigid_damping", "consistent_mass", "viscosity")
+OF_RATES = ("mass_damping", "stiffness_damping", "spring_damping", "rigid_damping", "consistent_mass", "viscosity", "sleeping")
 CHANGEABLE = ("mass_damping", "stiffness_damping", *FIBRE_NUMBERS)  # numbers of a material, besides `Composition.tet_numbers`
 
 
@@ -60,8 +60,28 @@ def _shorten(names: list[str]) -> str:
     return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
 
 
-def make_plan(scene: Scene, explicit: bool, multistep: bool, self_collision: bool = False, draggable: bool = False) -> Plan:
-    """Plan the features for a scene, the kind of integrator, self-collision, and draggable bodies."""
+def never_resting(scene: Scene) -> list[str]:
+    """Names of the bodies that never sleep: those with prescribed motion, loads along paths, Maxwell branches, volumes or lengths
+    that are kept, or connections to such bodies, or to obstacles that move."""
+    restless = set()
+    for body in scene.bodies:
+        kept = any(cavity.given == "volume" for cavity in body.cavities)
+        driven = any(one.path is not None for one in [*scene.constraints(body), *body.loads])
+        if kept or driven or body.composition.branches.shape[1]:
+            restless.add(body.name)
+    for one in scene.tendons:
+        if one.path is not None or one.is_inextensible:
+            restless.update(one.owners)
+    for one in scene.connections:
+        if scene.moves(one):
+            restless.update(one.owners)
+    return [body.name for body in scene.bodies if body.name in restless]
+
+
+def make_plan(
+    scene: Scene, explicit: bool, multistep: bool, self_collision: bool = False, draggable: bool = False, sleep: bool = True
+) -> Plan:
+    """Plan the features for a scene, the kind of integrator, self-collision, draggable bodies, and those that may sleep."""
     plan = Plan()
 
     def add_if_any(feature: str, test, why: str, why_not: str) -> None:
@@ -135,6 +155,14 @@ def make_plan(scene: Scene, explicit: bool, multistep: bool, self_collision: boo
         not explicit,
         "directions of negative curvature lead out of inverted tets",
         "explicit steps need forces only, and every law defines them for inverted tets too",
+    )
+    restless = never_resting(scene)
+    why_not = "not requested" if not sleep else "explicit steps move everything" if explicit else "every body is driven"
+    plan.add(
+        "sleeping",
+        sleep and not explicit and len(restless) < len(scene.bodies),
+        "implicit steps leave out bodies at rest" + (f", but for {_shorten(restless)}" if restless else ""),
+        why_not,
     )
     _add_collision(plan, scene, self_collision)
     return plan
