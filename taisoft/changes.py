@@ -191,7 +191,7 @@ def set_length(self: "Simulator", name: str, value: float) -> None:
 def _set_tendon(sim: "Simulator", given: str, name: str, value: float) -> None:
     dynamics = sim._open()
     change_tendon(sim.scene, given, name, value)
-    dynamics.loads_changed()
+    dynamics.loads_changed(*next(tendon for tendon in sim.scene.tendons if tendon.name == name).owners)
 
 
 def set_pressure(self: "Simulator", body: str, index: int, value: float) -> None:
@@ -221,13 +221,13 @@ def set_activation(self: "Simulator", body: str, value: float, region: int | str
     if callable(value):
         raise SceneError(f"{what}: it must be a number: give body.activate a path before the Simulator is made")
     activate_fibres(changed, value, region, what)
-    dynamics.loads_changed()
+    dynamics.loads_changed(changed.name)
 
 
 def _set_load(sim: "Simulator", kind: str, body: str, index: int, value) -> None:
-    dynamics = sim._open()
-    change_load(sim.scene.bodies[body_index(sim, body)], kind, index, value)
-    dynamics.loads_changed()
+    dynamics, changed = sim._open(), sim.scene.bodies[body_index(sim, body)]
+    change_load(changed, kind, index, value)
+    dynamics.loads_changed(changed.name)
 
 
 def drag(self: "Simulator", body: str, nodes, weights, target, stiffness: float) -> None:

@@ -209,12 +209,12 @@ class Dynamics:
         self.changes += 1
         self.stepper.numbers_changed()
 
-    def loads_changed(self) -> None:
-        """Follow a change of the scene's loads."""
+    def loads_changed(self, *bodies: str) -> None:
+        """Follow a change of the scene's loads on bodies."""
         self.changes += 1
         self.state.loads_changed()
         self.stepper.loads_changed()
-        self.stepper.wake()
+        self.stepper.wake(*bodies)
 
     def set_dt(self, dt: float) -> None:
         """Set dt [s] of the next step."""

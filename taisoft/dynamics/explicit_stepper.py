@@ -151,7 +151,7 @@ class ExplicitStepper:
         both = {"acceleration": self.work.acceleration, "reaction": self.work.reaction}
         return {name: field for name, field in both.items() if field is not None}
 
-    def wake(self) -> None:
+    def wake(self, *names: str) -> None:
         """Do nothing: nothing sleeps in explicit steps."""
 
     def snapshot(self) -> dict:

@@ -50,10 +50,11 @@ class ImplicitStepper(ImplicitStages):
         if self.sleep is not None:
             self.sleep.forget()
 
-    def wake(self) -> None:
-        """Wake all bodies that sleep."""
+    def wake(self, *names: str) -> None:
+        """Wake bodies, or without names all that sleep."""
         if self.sleep is not None:
-            self.sleep.wake_all()
+            own = [collider.name for collider in self.simulation.scene.colliders]
+            self.sleep.wake(np.isin(own, names or own))
 
     def numbers_changed(self) -> None:
         """Update for changed gravity or material numbers."""
@@ -63,7 +64,7 @@ class ImplicitStepper(ImplicitStages):
     def loads_changed(self) -> None:
         """Wake what is dragged: every stage reads the loads."""
         if self.sleep is not None and self.simulation.drag is not None:
-            self.sleep.keep_awake(self.simulation.drag[0])
+            self.sleep.wake(self.sleep.bodies_of(self.simulation.drag[0]))
 
     def reactions(self) -> np.ndarray:
         """Return the constraint forces of the last step, (n_nodes, 3) [N]."""

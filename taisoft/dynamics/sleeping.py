@@ -1,17 +1,18 @@
 """Sleeping bodies: what rests, with all that it touches, is left out of implicit steps in time.
 
 Bodies belong to one *island* if they are connected, or if the last search found contacts between them. An island falls asleep
-once its bodies have stayed where they are for LOOKS looks, LOOK steps apart, and all these steps have converged: no node has moved
-by more than STILL times the tolerance of Newton's method, in sizes of its body. Iterations within that tolerance may move a body
-at rest as far. What nothing holds up must not have moved but for rounding, since its momentum stays. The island's nodes are then
-held, its contacts set aside with their forces, and contacts are searched only between it and what does not rest. A step in which
-everything sleeps only counts its time.
+once all its bodies are at rest, after steps that have all converged. A body is at rest if for LOOKS looks, LOOK steps apart, no
+node has been farther from where it was at first than STILL times the tolerance of Newton's method, in sizes of the body, since
+iterations within that tolerance may move a body at rest as far; and if it is not farther at the last one than DRIFT times as far
+as in the first half of them, as what drifts or gains speed would be. The island's nodes are then held, its contacts set aside
+with their forces, and contacts are searched only between it and what does not rest. A step in which everything sleeps only counts
+its time.
 
 It wakes before a step whose search finds a contact with something awake or with an obstacle that moves; where only the iterations
-of the step found one that presses, that step is taken again. It wakes, too, when a load, a number, the state or dt changes, and
-when it is dragged. Some bodies never sleep, see `never_resting`.
+of the step found one that presses, that step is taken again. It wakes, too, with a change of a load, a number, the state or dt,
+and when it is dragged. Some bodies never sleep, see `never_resting`.
 
-Weak: a motion that is slower than that, such as creep, ends; in single precision that is some 1e-3 of a size in 200 steps.
+Weak: a creep that decays ends where the motion left is as small, in single precision some 1e-3 of a size.
 """
 
 from collections.abc import Callable
@@ -29,8 +30,8 @@ class Sleep:
     """asleep: (n_colliders,) bool, of bodies. tolerance: of Newton's method."""
 
     LOOK, LOOKS = 10, 20
-    STILL, MOST = 20.0, 2e-3  # the latter: of a body's size, the largest motion whatever the tolerance,
-    ROUNDING = 1e-12  # and that of what nothing holds up
+    STILL, MOST = 20.0, 2e-3  # the latter: of a body's size, the largest motion whatever the tolerance
+    DRIFT = 1.5
 
     def __init__(self, simulation: SimulationState, contact: ContactStep | NoContacts, tolerance: float):
         scene, layout = simulation.scene, simulation.layout
@@ -38,8 +39,7 @@ class Sleep:
         self._n, index = len(scene.bodies), {c.name: k for k, c in enumerate(scene.colliders)}
         self._body = np.repeat(np.arange(self._n), np.diff(layout.node_start))  # of each node
         sizes = np.maximum.reduceat(layout.rest, self._first) - np.minimum.reduceat(layout.rest, self._first)
-        self._size = sizes.max(axis=1)
-        self._limit = min(self.STILL * tolerance, self.MOST) * self._size
+        self._limit = min(self.STILL * tolerance, self.MOST) * sizes.max(axis=1)
         self._restless = np.isin([body.name for body in scene.bodies], never_resting(scene))
         self._links = [sorted(index[name] for name in one.owners) for one in scene.connections]
         self.asleep = np.zeros(len(scene.colliders), dtype=bool)
@@ -51,20 +51,23 @@ class Sleep:
         """Let all bodies be awake, and have just moved."""
         self._x: np.ndarray | None = None  # where bodies stay
         self._steps, self._n_islands = 0, 0
-        self._looks, self._moved = np.zeros(self._n, dtype=np.int64), np.zeros(self._n)  # the latter [m]
+        self._looks, self._early = (
+            np.zeros(self._n, dtype=np.int64),
+            np.zeros(self._n),
+        )  # the latter: motion in the first half [m]
         self._was_moving = np.zeros(len(self.asleep), dtype=bool)  # obstacles, at the last step
         self._hold(np.zeros_like(self.asleep))
 
     def snapshot(self) -> dict:
         """Return the state for a checkpoint."""
         x = np.zeros((0, 3)) if self._x is None else self._x
-        own = {"steps": self._steps, "looks": self._looks, "moved": self._moved, "x": x, "forces": self._forces}
+        own = {"steps": self._steps, "looks": self._looks, "early": self._early, "x": x, "forces": self._forces}
         return own | {"asleep": self.asleep, "island": self._island, "was_moving": self._was_moving}
 
     def restore(self, kept: dict) -> None:
         """Restore a `snapshot`, after the contacts."""
         self._steps, self._x = int(kept["steps"]), np.array(kept["x"]) if len(kept["x"]) else None
-        self._looks, self._moved, self._forces = (np.array(kept[name]) for name in ("looks", "moved", "forces"))
+        self._looks, self._early, self._forces = (np.array(kept[name]) for name in ("looks", "early", "forces"))
         self._island, self._was_moving = np.array(kept["island"]), np.array(kept["was_moving"])
         self._n_islands = int(self._island.max()) + 1
         self._hold(np.array(kept["asleep"]))
@@ -103,15 +106,18 @@ class Sleep:
             return
         x = self._simulation.model.state.x.to_numpy().astype(np.float64)
         if self._x is None:
-            self._x, self._looks[:], self._moved[:] = x.copy(), 0, 0.0
+            self._x, self._looks[:] = x.copy(), 0
             return
         moved = np.sqrt(np.maximum.reduceat(((x - self._x) ** 2).sum(axis=1), self._first))
         is_still = (moved <= self._limit) & ~self._restless
         self._stay_at(x, ~is_still)
         self._looks += is_still
-        self._moved = np.where(is_still, np.maximum(self._moved, moved), 0.0)
-        if (is_still & (self._looks >= self.LOOKS) & ~self.asleep[: self._n]).any():
-            self._fall_asleep(time, reactions)
+        self._early = np.where(2 * self._looks <= self.LOOKS, np.maximum(self._early * (self._looks > 1), moved), self._early)
+        ready = self._looks >= self.LOOKS
+        self._stay_at(x, drifts := ready & (moved > self.DRIFT * self._early))
+        ready &= ~drifts
+        if (ready & ~self.asleep[: self._n]).any():
+            self._fall_asleep(time, ready, reactions)
 
     def _stay_at(self, x: np.ndarray, bodies: np.ndarray) -> None:
         """Let bodies (n,) bool have moved to positions (n_nodes, 3) just now."""
@@ -133,26 +139,21 @@ class Sleep:
 
     # --- falling asleep and waking ------------------------------------------------------------------------------------
 
-    def _fall_asleep(self, time: float, reactions: Callable[[], np.ndarray]) -> None:
+    def _fall_asleep(self, time: float, ready: np.ndarray, reactions: Callable[[], np.ndarray]) -> None:
+        """Let the islands fall asleep all of whose bodies are ready (n,) bool, that touch nothing that moves, and that nothing is
+        inside."""
         n, contact, moving = self._n, self._contact, self._moving(time)
         if not contact.paths.none_cross:
             return
-        pairs, pressing = np.zeros((0, 2), dtype=np.int64), np.zeros(0, dtype=bool)
-        ready = self._looks >= self.LOOKS
+        pairs = np.zeros((0, 2), dtype=np.int64)
         if not contact.idle:
             rows = contact.awake()
-            pairs, pressing = rows.collider.astype(np.int64), (rows.impulse * rows.normal).sum(axis=1) > 0.0
+            pairs = rows.collider.astype(np.int64)
             ready &= ~np.isin(np.arange(n), pairs[(rows.gap < 0.0) | moving[pairs].any(axis=1)])
         links = [(one[0], other) for one in self._links for other in one[1:]]
         a, b = np.concatenate([pairs, np.array(links, dtype=np.int64).reshape(-1, 2)]).T
         among = (a < n) & (b < n)
         n_islands, island = linked_groups(a[among], b[among], n)
-        # what holds a body up: an obstacle that it is connected to or pressed on, or nodes that are fixed
-        held = np.logical_or.reduceat(self._simulation.dirichlet.constrained().any(axis=1), self._first)
-        holds = ~among & np.concatenate([pressing, np.ones(len(links), dtype=bool)])
-        held |= np.isin(np.arange(n), np.concatenate([a[holds], b[holds]]))
-        is_held = np.bincount(island, held, n_islands) > 0
-        ready &= is_held[island] | (self._moved <= self.ROUNDING * self._size)
         falls = (np.bincount(island, ~ready, n_islands) == 0)[island] & ~self.asleep[:n]
         if not falls.any():
             return
@@ -170,8 +171,9 @@ class Sleep:
         self._simulation.set_state(x, v)
 
     def wake(self, bodies: np.ndarray) -> bool:
-        """Wake sleeping bodies, of colliders (n,) bool, with their islands; return whether there are any."""
+        """Wake bodies, of colliders (n,) bool, and their islands, and let them be awake a while; return whether any slept."""
         n, woken = self._n, np.zeros_like(self.asleep)
+        self._looks[bodies[:n]] = 0
         woken[:n] = self.asleep[:n] & np.isin(self._island, self._island[bodies[:n] & self.asleep[:n]])
         if not woken.any():
             return False
@@ -181,16 +183,9 @@ class Sleep:
         self._hold(self.asleep & ~woken)
         return True
 
-    def wake_all(self) -> None:
-        """Wake everything."""
-        self.wake(self.asleep)
-
-    def keep_awake(self, nodes: np.ndarray) -> None:
-        """Wake the bodies of nodes (k,), which must not rest in the next step."""
-        bodies = np.zeros_like(self.asleep)
-        bodies[np.unique(self._body[nodes])] = True
-        self.wake(bodies)
-        self._looks[bodies[: self._n]] = 0
+    def bodies_of(self, nodes: np.ndarray) -> np.ndarray:
+        """Return the bodies of nodes (k,), of colliders (n,) bool."""
+        return np.isin(np.arange(len(self.asleep)), self._body[nodes])
 
     def _hold(self, asleep: np.ndarray) -> None:
         """Hold the nodes of bodies, of colliders (n,) bool, and no others."""
