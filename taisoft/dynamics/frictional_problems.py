@@ -15,7 +15,7 @@ class FrictionalProblems:
     REDUCTION, LAW_REDUCTION, TOLERANCE_FRACTION, LAW_TOLERANCE_FRACTION = 0.1, 0.1, 0.3, 0.8
     LAW_BALANCE = 0.03  # laws' residual over the required relative |r|; the next matrix would undo more accuracy
     MULTIPLIER_FRACTION = 0.3  # of the required |r|, ends the steps under one multiplier: updates at a large |r| overshoot
-    NEAR_FLOOR = 4.0  # times the floor of |r|: below it, |r| may be mostly rigid motion
+    NEAR_FLOOR = 6.0  # times the floor of |r|: below it, |r| may be mostly rigid motion
     TRIAL = 16  # problems in a row that are solved directly before a stage tries iterations again
     R_STALLED, MAX_R_STALLED = 1000.0, 1e5  # smallest first R and upper bound without friction, where the laws stalled before
 
