@@ -104,6 +104,7 @@ class ImplicitStages:
         self.tolerance = settings.newton_tolerance or DEFAULT_TOLERANCE[settings.precision]
         self.contact_tolerance = settings.contact_tolerance or TOLERANCE[settings.precision]
         self.linear_tolerance = settings.linear_tolerance
+        self._law_aim = settings.contact_tolerance  # what was asked for is enough
 
     def forget(self) -> None:
         """Discard the history, after the state was set."""
@@ -252,6 +253,7 @@ class ImplicitStages:
             scheme.one_iteration,
             # prescribed nodes change their velocity once a step, not twice within the midpoint's half step
             0.5 if scheme.midpoint else 1.0,
+            law_aim=self._law_aim,
         )
 
     def compile_hard_steps(self) -> None:
