@@ -40,10 +40,12 @@ def find_factors(W: sp.spmatrix) -> np.ndarray:
 
 def prox(z: np.ndarray, friction: np.ndarray) -> np.ndarray:
     """Project z (k,3) to admissible impulses (k,3): first the normal part, then the tangential part onto its friction disk."""
-    normal = np.maximum(z[:, 0], 0.0)
-    size, radius = np.hypot(z[:, 1], z[:, 2]), friction * normal
-    scale = np.divide(radius, size, out=np.ones_like(size), where=size > radius)
-    return np.column_stack([normal, scale * z[:, 1], scale * z[:, 2]])
+    found = z.copy()
+    np.maximum(z[:, 0], 0.0, out=found[:, 0])
+    size, radius = np.hypot(z[:, 1], z[:, 2]), friction * found[:, 0]
+    slips = size > radius
+    found[slips, 1:] *= (radius[slips] / size[slips])[:, None]
+    return found
 
 
 def natural_map(u: np.ndarray, friction: np.ndarray, factor: np.ndarray, r: np.ndarray) -> np.ndarray:

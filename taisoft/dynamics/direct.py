@@ -55,6 +55,7 @@ class DirectSolver:
         self._nodes = np.flatnonzero(m.dependents.number.to_numpy() < 0) if m.has_dependents else np.arange(m.n_nodes)
         self._factor: Factor | None = None
         self._has_factor = False  # of the present matrix
+        self._free = np.zeros((0, 3))  # (nodes, 3), 1 on free axes, of the last factor
 
     def matrix_changed(self) -> None:
         """Update for a matrix that was formed."""
@@ -110,13 +111,14 @@ class DirectSolver:
 
     def _factorise(self, k: StageContacts) -> None:
         """Factorise A on the free axes, without the contacts' terms."""
-        self._free = (self._model.free.to_numpy()[self._nodes] > 0.0).astype(np.float64)
-        value, diagonal = download([self._A.value, k.coupling.base])
-        values = np.concatenate([value.reshape(-1), diagonal.reshape(-1)])[self._stored].astype(np.float64)
-        if not self._free.all():
-            free = self._free.reshape(-1)
-            values *= free[self._row] * free[self._column]
-            values += (self._row == self._column) * (1.0 - free[self._row])
+        free = (self._model.free.host[self._nodes] > 0.0).astype(np.float64)
+        if not np.array_equal(free, self._free):
+            self._free, free = free, free.reshape(-1)
+            self._held = np.flatnonzero(free[self._row] * free[self._column] == 0.0)
+        values = np.concatenate([self._A.value.host.reshape(-1), k.coupling.base.host.reshape(-1)])[self._stored].astype(
+            np.float64
+        )
+        values[self._held] = self._row[self._held] == self._column[self._held]
         self._values = values
         self._factor.fronts.factorise(values)
 
