@@ -58,11 +58,6 @@ def relative(changed: float, size: float) -> float:
     return changed / size if size > 0.0 else float(changed != 0.0)
 
 
-def find_residual(W, b: np.ndarray, friction: np.ndarray, r: np.ndarray, factor: np.ndarray | None = None) -> float:
-    """|r - prox(r - f (W r + b))| / |r|. factor: f (k,2), by default `find_factors` of W."""
-    return residual_at((W @ r.ravel() + b).reshape(-1, 3), friction, find_factors(W) if factor is None else factor, r)
-
-
 def residual_at(u: np.ndarray, friction: np.ndarray, factor: np.ndarray, r: np.ndarray) -> float:
     """|r - prox(r - f u)| / |r| at velocities u (k,3)."""
     return float(relative(np.linalg.norm(natural_map(u, friction, factor, r)), np.linalg.norm(r)))

@@ -144,13 +144,11 @@ class DirectSolver:
             unknowns = factor.unknowns_of(part)
             inside = (column >= unknowns.start) & (column < unknowns.stop)
             if inside.any():
-                own = np.zeros(3 * n, dtype=bool)
-                own[row[inside]] = True
-                rows, at = np.flatnonzero(own), np.cumsum(own) - 1
+                rows, at = np.unique(row[inside], return_inverse=True)
                 Y = np.zeros((unknowns.stop - unknowns.start, len(rows)))
-                np.add.at(Y.reshape(-1), (column[inside] - unknowns.start) * len(rows) + at[row[inside]], J[inside])
+                np.add.at(Y.reshape(-1), (column[inside] - unknowns.start) * len(rows) + at, J[inside])
                 factor.forward(part, Y)
-                touched = np.flatnonzero(own.reshape(-1, 3).any(axis=1))
+                touched = np.unique(rows // 3)
                 W, place = np.zeros((3 * len(touched),) * 2), np.searchsorted(touched, rows // 3) * 3 + rows % 3
                 half = sl.blas.dsyrk(1.0, Y.T, lower=1)
                 W[place[:, None], place] = half + np.tril(half, -1).T
