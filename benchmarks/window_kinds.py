@@ -17,7 +17,6 @@ from taisoft.backend.arrays import FieldArena
 from taisoft.backend.counters import intercepted
 from taisoft.backend.launching import Kernels
 from taisoft.backend.runtime import kernel
-from taisoft.contact import augmented_lagrangian
 from taisoft.contact.matrix_contacts import MatrixContacts
 from taisoft.dynamics import linear_solver, stage_system
 from taisoft.dynamics.direct import DirectSolver
@@ -47,8 +46,7 @@ OF = {  # of packages, modules and functions of taisoft; the longest name that f
 }
 DENSE = (
     *((DirectSolver, name) for name in ("_analyse", "_factorise", "_find_delassus", "solve", "_imbalance")),
-    *((MatrixContacts, "solve"), (augmented_lagrangian, "find_residual")),
-    *((linear_solver, "build_hierarchy"), (stage_system, "set_frame_factors")),
+    *((MatrixContacts, "solve"), (linear_solver, "build_hierarchy"), (stage_system, "set_frame_factors")),
 )
 PREPARING = "preparing"  # launches that are watched, once for each kernel: no part of a step
 STRETCHES, REPEATS = 9, 300

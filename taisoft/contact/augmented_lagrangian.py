@@ -40,10 +40,12 @@ def find_factors(W: sp.spmatrix) -> np.ndarray:
 
 def prox(z: np.ndarray, friction: np.ndarray) -> np.ndarray:
     """Project z (k,3) to admissible impulses (k,3): first the normal part, then the tangential part onto its friction disk."""
-    normal = np.maximum(z[:, 0], 0.0)
-    size, radius = np.hypot(z[:, 1], z[:, 2]), friction * normal
-    scale = np.divide(radius, size, out=np.ones_like(size), where=size > radius)
-    return np.column_stack([normal, scale * z[:, 1], scale * z[:, 2]])
+    found = z.copy()
+    np.maximum(z[:, 0], 0.0, out=found[:, 0])
+    size, radius = np.hypot(z[:, 1], z[:, 2]), friction * found[:, 0]
+    slips = size > radius
+    found[slips, 1:] *= (radius[slips] / size[slips])[:, None]
+    return found
 
 
 def natural_map(u: np.ndarray, friction: np.ndarray, factor: np.ndarray, r: np.ndarray) -> np.ndarray:
@@ -54,11 +56,6 @@ def natural_map(u: np.ndarray, friction: np.ndarray, factor: np.ndarray, r: np.n
 def relative(changed: float, size: float) -> float:
     """Residual from |r - prox(r - f u)| and |r|; 1 if r is 0 but not a solution."""
     return changed / size if size > 0.0 else float(changed != 0.0)
-
-
-def find_residual(W, b: np.ndarray, friction: np.ndarray, r: np.ndarray, factor: np.ndarray | None = None) -> float:
-    """|r - prox(r - f (W r + b))| / |r|. factor: f (k,2), by default `find_factors` of W."""
-    return residual_at((W @ r.ravel() + b).reshape(-1, 3), friction, find_factors(W) if factor is None else factor, r)
 
 
 def residual_at(u: np.ndarray, friction: np.ndarray, factor: np.ndarray, r: np.ndarray) -> float:

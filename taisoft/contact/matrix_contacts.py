@@ -8,9 +8,11 @@ import scipy.sparse as sp
 
 from taisoft.backend.arrays import FieldArena, download
 from taisoft.contact import augmented_lagrangian, semismooth
+from taisoft.contact.augmented_lagrangian import residual_at
 from taisoft.contact.colouring import colour_greedy, matrix_graph, store
-from taisoft.contact.problem import ContactProblem, build_matrix_problem, fill_field, fill_matrix_problem, read_entries
+from taisoft.contact.problem import ContactProblem, build_matrix_problem, fill_matrix_problem, read_entries
 from taisoft.contact.solve import SolveResult, solve
+from taisoft.ranges import owners
 
 DENSE, NEWTON = 900, 15  # most rows of a W for Newton's method, and its maximum iterations
 TIGHTER = 3  # solves, each to a smaller residual, until that with other r-factors is small enough
@@ -51,15 +53,20 @@ class MatrixContacts:
             self.release()
             self._arena = arena
         fill_matrix_problem(p, W, b, friction)
-        fill_field(p.r, r)
+        p.r.from_numpy(r, 0)
         if method == "coloured_gauss_seidel":
             store(p, colour_greedy(matrix_graph(W)))
 
-        def residual(r: np.ndarray, factor: np.ndarray | None = None) -> float:
-            return augmented_lagrangian.find_residual(W, b, friction, r, factor)
+        is_dense = factor is not None and 3 * k <= DENSE  # without other factors, islands are solved one by one
+        product, own = _dense(W) if is_dense else W, augmented_lagrangian.find_factors(W)
+
+        def residuals(r: np.ndarray) -> tuple[float, float]:
+            u = (product @ r.reshape(-1) + b).reshape(-1, 3)
+            return residual_at(u, friction, own, r), 0.0 if factor is None else residual_at(u, friction, factor, r)
 
         def holds(r: np.ndarray) -> bool:
-            return residual(r) <= tolerance and (factor is None or residual(r, factor) <= limit)
+            found = residuals(r)
+            return found[0] <= tolerance and found[1] <= limit
 
         goal, iterations = tolerance, 0
         for _ in range(1 if factor is None else TIGHTER):
@@ -67,17 +74,16 @@ class MatrixContacts:
             r, iterations = p.r.to_numpy(k), iterations + result.iterations
             if result.converged and holds(r):
                 return r, replace(result, iterations=iterations)
-            if factor is not None and 3 * k <= DENSE:  # without, islands are solved one by one
-                if found := semismooth.solve(W.toarray(), b, friction, r, p.factor.to_numpy(k), holds, NEWTON):
-                    return found[0], SolveResult(iterations + found[1], residual(found[0]), True)
+            if is_dense and (found := semismooth.solve(product, b, friction, r, own, holds, NEWTON)):
+                return found[0], SolveResult(iterations + found[1], residuals(found[0])[0], True)
             if not result.converged:
                 r, history = augmented_lagrangian.solve(W.tocsr(), b, friction, r, goal, outer)
                 iterations += len(history) - 1
                 result = SolveResult(iterations, history[-1], history[-1] <= goal)
                 if not result.converged or holds(r):
                     break
-                fill_field(p.r, r)
-            goal *= 0.5 * limit / max(residual(r, factor), limit)
+                p.r.from_numpy(r, 0)
+            goal *= 0.5 * limit / max(residuals(r)[1], limit)
         return r, replace(result, iterations=iterations)
 
     @property
@@ -88,6 +94,14 @@ class MatrixContacts:
     def release(self) -> None:
         """Free the fields."""
         self._arena.release()
+
+
+def _dense(W: sp.bsr_matrix) -> np.ndarray:
+    """W (3k,3k)."""
+    k = len(W.indptr) - 1
+    blocks = np.zeros((k, k, 3, 3))
+    blocks[owners(np.diff(W.indptr)), W.indices] = W.data
+    return blocks.swapaxes(1, 2).reshape(3 * k, 3 * k)
 
 
 def frames(p: ContactProblem) -> np.ndarray:

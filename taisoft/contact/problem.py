@@ -237,12 +237,12 @@ def fill_matrix_problem(problem: ContactProblem, W: sp.spmatrix, b: np.ndarray, 
     W, k = sp.bsr_matrix(W, blocksize=(3, 3)), len(friction)
     W.sort_indices()
     problem.count[0] = k
-    fill_field(problem.row_start, W.indptr)
-    fill_field(problem.column, W.indices)
-    fill_field(problem.block, W.data.reshape(-1, 9))
-    fill_field(problem.b, b.reshape(k, 3))
-    fill_field(problem.friction, friction)
-    fill_field(problem.sweep.order, np.arange(k))
+    problem.row_start.from_numpy(W.indptr, 0)
+    problem.column.from_numpy(W.indices, 0)
+    problem.block.from_numpy(W.data.reshape(-1, 9), 0)
+    problem.b.from_numpy(b.reshape(k, 3), 0)
+    problem.friction.from_numpy(friction, 0)
+    problem.sweep.order.from_numpy(np.arange(k), 0)
     find_factors(problem)
 
 

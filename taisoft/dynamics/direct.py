@@ -24,7 +24,7 @@ from taisoft.contact.problem import read_entries
 from taisoft.dynamics.contact_terms import StageContacts
 from taisoft.fem.model import Model
 from taisoft.linear.block_csr import BLOCK, BlockCsr
-from taisoft.linear.multifrontal import Multifrontal
+from taisoft.linear.factor import Factor, build_factor
 from taisoft.ranges import owners
 from taisoft.scene.rigid import FRAME
 
@@ -53,8 +53,9 @@ class DirectSolver:
         self.is_rigid = m.has_rigid_tets and FRAME * m.rigid_tets.n + m.dependents.n == m.n_nodes
         self._max_rows, *self._limits = self.RIGID if self.is_rigid else self.SOFT
         self._nodes = np.flatnonzero(m.dependents.number.to_numpy() < 0) if m.has_dependents else np.arange(m.n_nodes)
-        self._factor: Multifrontal | None = None
+        self._factor: Factor | None = None
         self._has_factor = False  # of the present matrix
+        self._free = np.zeros((0, 3))  # (nodes, 3), 1 on free axes, of the last factor
 
     def matrix_changed(self) -> None:
         """Update for a matrix that was formed."""
@@ -67,10 +68,11 @@ class DirectSolver:
             return math.inf
         if self._factor is None:
             self._analyse()
+        factor = self._factor.fronts
         rows = 3 * np.count_nonzero(stage_contacts.problem.r.to_numpy(n)[:, 0])
-        entries = self._factor.n_entries * min(1.0, 2.0 / len(self._factor.parts))  # a row touches two parts at most
+        entries = factor.n_entries * min(1.0, 2.0 / len(factor.parts))  # a row touches two parts at most
         dense = 0.0 if self.is_rigid else rows**3 * self.DENSE
-        return self._factor.seconds + self.CALLS + rows * entries * self.PRODUCT + dense
+        return factor.seconds + self.CALLS + rows * entries * self.PRODUCT + dense
 
     def _analyse(self) -> None:
         """Find what depends on the pattern of A alone."""
@@ -85,15 +87,10 @@ class DirectSolver:
         blocks = np.concatenate([among, self._A.column.shape[0] + self._nodes])[order]  # among those of A, then its diagonal
         row, column = row[order], column[order]
         start = np.concatenate([[0], np.cumsum(np.bincount(row, minlength=len(own)))])
-        self._number, self._factor = number, Multifrontal(start, column)
-        # entries of the lower triangle: row and column in A and in the order of elimination, and place among the stored numbers
-        axis = np.arange(3)
-        at = [3 * row[:, None, None] + axis[:, None], 3 * column[:, None, None] + axis]
-        at.append(BLOCK * blocks[:, None, None] + 4 * axis + axis[:, None])
-        i, j, stored = (one.reshape(-1) for one in np.broadcast_arrays(*at))
-        lower = self._factor.place[i] >= self._factor.place[j]
-        self._row, self._column, self._stored = i[lower], j[lower], stored[lower]
-        self._places = self._factor.places(self._factor.place[self._row], self._factor.place[self._column])
+        self._number, self._factor = number, build_factor(start, column, 3)
+        # entries of the lower triangle: row and column, and place among the stored numbers
+        block, i, j = np.unravel_index(self._factor.fronts.lower, (len(row), 3, 3))
+        self._row, self._column, self._stored = 3 * row[block] + i, 3 * column[block] + j, BLOCK * blocks[block] + 4 * j + i
 
     def prepare(self, stage_contacts: StageContacts) -> bool:
         """Factorise the matrix that was formed; return whether that is possible and a solve is not expected to take too long.
@@ -114,15 +111,16 @@ class DirectSolver:
 
     def _factorise(self, k: StageContacts) -> None:
         """Factorise A on the free axes, without the contacts' terms."""
-        self._free = (self._model.free.to_numpy()[self._nodes] > 0.0).astype(np.float64)
-        value, diagonal = download([self._A.value, k.coupling.base])
-        values = np.concatenate([value.reshape(-1), diagonal.reshape(-1)])[self._stored].astype(np.float64)
-        if not self._free.all():
-            free = self._free.reshape(-1)
-            values *= free[self._row] * free[self._column]
-            values += (self._row == self._column) * (1.0 - free[self._row])
+        free = (self._model.free.host[self._nodes] > 0.0).astype(np.float64)
+        if not np.array_equal(free, self._free):
+            self._free, free = free, free.reshape(-1)
+            self._held = np.flatnonzero(free[self._row] * free[self._column] == 0.0)
+        values = np.concatenate([self._A.value.host.reshape(-1), k.coupling.base.host.reshape(-1)])[self._stored].astype(
+            np.float64
+        )
+        values[self._held] = self._row[self._held] == self._column[self._held]
         self._values = values
-        self._factor.factorise(values, self._places)
+        self._factor.fronts.factorise(values)
 
     def _find_rows(self, entries: tuple, axes: np.ndarray, friction: np.ndarray) -> None:
         """Find the rows of J (entries, axes of the contact, of the node), 0 for tangents without friction.
@@ -136,24 +134,21 @@ class DirectSolver:
         self._J = contact, node, weight[:, None, None] * J[contact] * self._free[node][:, None, :]
 
     def _find_delassus(self, active: np.ndarray) -> sp.bsr_matrix:
-        """Return W of the active contacts (k,), numbered anew; keep the unknowns, rows and Y of each part where J is not 0."""
-        (contact, node, J), factor, n = self._J, self._factor, int(active.sum())
+        """Return W of the active contacts (k,), numbered anew."""
+        (contact, node, J), factor, n = self._J, self._factor.fronts, int(active.sum())
         contact = np.where(active, np.cumsum(active) - 1, -1)[contact]
         entry, axis, of = np.nonzero(J * (contact >= 0)[:, None, None])
         row, column, J = 3 * contact[entry] + axis, factor.place[3 * node[entry] + of], J[entry, axis, of]
-        keys, blocks, self._halves = [], [], []
+        keys, blocks = [], []
         for part in factor.parts:
             unknowns = factor.unknowns_of(part)
             inside = (column >= unknowns.start) & (column < unknowns.stop)
             if inside.any():
-                own = np.zeros(3 * n, dtype=bool)
-                own[row[inside]] = True
-                rows, at = np.flatnonzero(own), np.cumsum(own) - 1
+                rows, at = np.unique(row[inside], return_inverse=True)
                 Y = np.zeros((unknowns.stop - unknowns.start, len(rows)))
-                np.add.at(Y.reshape(-1), (column[inside] - unknowns.start) * len(rows) + at[row[inside]], J[inside])
+                np.add.at(Y.reshape(-1), (column[inside] - unknowns.start) * len(rows) + at, J[inside])
                 factor.forward(part, Y)
-                self._halves.append((unknowns, rows, Y))
-                touched = np.flatnonzero(own.reshape(-1, 3).any(axis=1))
+                touched = np.unique(rows // 3)
                 W, place = np.zeros((3 * len(touched),) * 2), np.searchsorted(touched, rows // 3) * 3 + rows % 3
                 half = sl.blas.dsyrk(1.0, Y.T, lower=1)
                 W[place[:, None], place] = half + np.tril(half, -1).T
@@ -181,14 +176,16 @@ class DirectSolver:
         # at the present x: iterations may have moved it, and the residual with it
         x, v, residual = download([m.state.x, m.state.v, k.residual_linear])
         residual = (self._free * residual.astype(np.float64)[self._nodes]).reshape(-1)
-        y = self._factor.halfway(residual)
+        change = -self._factor.solution(residual)  # without impulses
         friction, factor, r = download([p.friction, p.factor, k.work.kept], n)
         entries, axes = read_entries(p), frames(p)
         self._find_rows(entries, axes, friction)
         start = self._velocities(k, entries, axes, x, beta)
         active, iterations = (r[:, 0] > 0.0) | (start[:, 0] < 0.0), 0
+        b = start + self._contact_velocities(change, n)
         for _ in range(self.ROUNDS):
-            r, change, n_iterations = self._solve_active(active, start, y, r, friction, factor, tolerance)
+            r, n_iterations = self._solve_active(active, b, r, friction, factor, tolerance)
+            change = self._factor.solution(self._forces(r) - residual)
             iterations += n_iterations
             u = start + self._contact_velocities(change, n)
             if not (closes := ~active & (u[:, 0] < 0.0)).any():
@@ -205,32 +202,23 @@ class DirectSolver:
         return iterations, law_residual <= tolerance, self._imbalance(change, residual, r) if with_residual else 0.0
 
     def _solve_active(
-        self,
-        active: np.ndarray,
-        start: np.ndarray,
-        y: np.ndarray,
-        r: np.ndarray,
-        friction: np.ndarray,
-        factor: np.ndarray,
-        tolerance: float,
-    ) -> tuple[np.ndarray, np.ndarray, int]:
-        """Return impulses (k,3), which only active contacts have, the change of v (n,), and the number of iterations.
+        self, active: np.ndarray, b: np.ndarray, r: np.ndarray, friction: np.ndarray, factor: np.ndarray, tolerance: float
+    ) -> tuple[np.ndarray, int]:
+        """Return impulses (k,3), which only active contacts have, and the number of iterations from the start r. b: (k,3)."""
+        found = np.zeros_like(r)
+        if not active.any():
+            return found, 0
+        given = friction[active], r[active], "gauss_seidel", self.FRACTION * tolerance, *self._limits
+        W = self._find_delassus(active)
+        found[active], result = self._contacts.solve(W, b[active].reshape(-1), *given, factor[active], self.MET * tolerance)
+        return found, result.iterations
 
-        start: (k,3) u; y: L^-1 r_0 (n,); r: impulses to start from.
-        """
-        W, b = self._find_delassus(active), start[active].reshape(-1)
-        for unknowns, rows, Y in self._halves:
-            b[rows] -= y[unknowns] @ Y
-        goals = self.FRACTION * tolerance, self.MET * tolerance
-        found, pushed, impulses, n = np.zeros_like(r), -y, r[active], 0
-        if active.any():
-            solve, given = self._contacts.solve, (friction[active], impulses, "gauss_seidel", goals[0], *self._limits)
-            impulses, result = solve(W, b, *given, factor[active], goals[1])
-            n = result.iterations
-        for unknowns, rows, Y in self._halves:
-            pushed[unknowns] += Y @ impulses.reshape(-1)[rows]
-        found[active] = impulses
-        return found, self._factor.backward(pushed), n
+    def _forces(self, r: np.ndarray) -> np.ndarray:
+        """J^T r (n,) of impulses r (k,3)."""
+        contact, node, J = self._J
+        found = np.zeros((len(self._nodes), 3))
+        np.add.at(found, node, np.einsum("eij,ei->ej", J, r[contact]))
+        return found.reshape(-1)
 
     def _contact_velocities(self, change: np.ndarray, n: int) -> np.ndarray:
         """J s (k,3) of a change s (n,) of v."""
@@ -241,11 +229,10 @@ class DirectSolver:
 
     def _imbalance(self, change: np.ndarray, residual: np.ndarray, r: np.ndarray) -> float:
         """|A s - J^T r + r_0| of a change s (n,)."""
-        n, (contact, node, J) = len(change), self._J
+        n = len(change)
         lower = sp.csr_matrix((self._values, (self._row, self._column)), shape=(n, n))
-        left = (lower @ change + lower.T @ change - lower.diagonal() * change + residual).reshape(-1, 3)
-        np.subtract.at(left, node, np.einsum("eij,ei->ej", J, r[contact]))
-        return float(np.linalg.norm(left))
+        left = lower @ change + lower.T @ change - lower.diagonal() * change
+        return float(np.linalg.norm(left + residual - self._forces(r)))
 
     def _velocities(self, k: StageContacts, entries: tuple, axes: np.ndarray, x: np.ndarray, beta: float) -> np.ndarray:
         """u (k,3) at positions x (n_nodes,3), see `contact_terms.stage_velocity_of`. entries, axes: as for `_find_rows`."""

@@ -25,9 +25,9 @@ from taisoft.backend.arrays import FieldArena, upload
 from taisoft.dynamics.stage import Stage
 from taisoft.fem.model import Model
 from taisoft.linear import gauss_seidel, pcg, volumes
-from taisoft.linear.banded import BandedPreconditioner
 from taisoft.linear.block_csr import BlockCsr
 from taisoft.linear.coarse_correction import CoarseCorrection
+from taisoft.linear.factor import Factor
 from taisoft.linear.hierarchy import build_hierarchy, has_narrow_band
 from taisoft.linear.jacobi import JACOBI
 from taisoft.linear.pcg_work import LinearResult, PcgWork
@@ -95,7 +95,7 @@ class LinearSolver:
 
     def release(self) -> None:
         """Discard the hierarchy; the next solve by multigrid builds a new one."""
-        self._hierarchy: BandedPreconditioner | CoarseCorrection | None = None
+        self._hierarchy: Factor | CoarseCorrection | None = None
         self._built: tuple | None = None  # (c, beta, x, free) of the last build
 
     def snapshot(self) -> dict:

@@ -8,10 +8,10 @@ import numpy as np
 from taisoft.fem.model import Model
 from taisoft.fem.node_graph import whole_rows
 from taisoft.linear import block_csr
-from taisoft.linear.banded import BandedPreconditioner
 from taisoft.linear.block_csr import BlockCsr
 from taisoft.linear.coarse_correction import CoarseCorrection
-from taisoft.linear.multigrid import block_rows, factorise, narrow_order
+from taisoft.linear.factor import Factor, factorised
+from taisoft.linear.multigrid import block_rows, is_narrow
 
 
 def rows_with_diagonals(model: Model, A: BlockCsr) -> tuple[np.ndarray, np.ndarray]:
@@ -23,19 +23,19 @@ def rows_with_diagonals(model: Model, A: BlockCsr) -> tuple[np.ndarray, np.ndarr
 
 def has_narrow_band(model: Model, A: BlockCsr) -> bool:
     """Whether matrices with the pattern of A are factorised."""
-    return narrow_order(*rows_with_diagonals(model, A), 3) is not None
+    return is_narrow(*rows_with_diagonals(model, A), 3)
 
 
-def build_hierarchy(model: Model, A: BlockCsr, x: np.ndarray, free: np.ndarray) -> BandedPreconditioner | CoarseCorrection:
+def build_hierarchy(model: Model, A: BlockCsr, x: np.ndarray, free: np.ndarray) -> Factor | CoarseCorrection:
     """Build the preconditioner of A on the free axes (n_nodes, 3) bool. x: (n_nodes, 3) positions [m].
 
     Raises numpy.linalg.LinAlgError if A is not positive definite, as far as the factorisations show.
     """
     start, column = rows_with_diagonals(model, A)
-    if narrow_order(start, column, 3) is None:
+    if not is_narrow(start, column, 3):
         return CoarseCorrection(model, A, start, column, x, free)
     matrix = block_csr.to_bsr(model, A)
     row = block_rows(matrix)
     matrix.data *= free[row][:, :, None] & free[matrix.indices][:, None, :]
     matrix.data[matrix.indices == row] += np.eye(3) * ~free[:, :, None]
-    return BandedPreconditioner(factorise(matrix))
+    return factorised(matrix)

@@ -6,7 +6,7 @@ is P^T A P. A cycle is, for a residual r and two steps sigma_1 and sigma_2 of a 
     x = sigma_1 S r,   x += sigma_2 S (r - A x),   x += P coarse(P^T (r - A x)),
     x += sigma_2 S (r - A x),   x += sigma_1 S (r - A x).
 With |(1 - sigma_1 z) (1 - sigma_2 z)| < 1 for the eigenvalues z of S A, that is symmetric and positive definite if A is. The
-number of iterations hardly depends on the size of the mesh. The coarsest level is solved by a banded Cholesky factorisation.
+number of iterations hardly depends on the size of the mesh. The coarsest level is solved by a Cholesky factorisation.
 Levels are built on the host in f64; a cycle runs in kernels in the model's precision, but for the coarsest level.
 Source: Vanek, Mandel and Brezina, "Algebraic multigrid by smoothed aggregation for second and fourth order elliptic problems",
 Computing 56, 1996.
@@ -17,22 +17,21 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.linalg as sl
 import scipy.sparse as sp
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from taisoft.backend.arrays import FieldArena
 from taisoft.linear.aggregation import MODES, prolongation
 from taisoft.linear.block_rows import LANES, CycleLevel, ascend, descend, padded, upload_matrix
+from taisoft.linear.factor import factorised
 from taisoft.mesh.aggregates import aggregate
 from taisoft.ranges import owners
 
 STEPS = 1.05, 3.0  # sigma_1, sigma_2: errors at z from 0.2 to 1 are reduced to 0.32 at most; below 1 up to z = 1.28
 PROLONGATOR = 4.0 / 3.0  # omega lambda
 POWER_STEPS = 12  # for that eigenvalue, which they give to about a tenth
-NARROW, SMALL = 300, 900  # band and unknowns of a level that is factorised
+NARROW, SMALL = 301, 900  # band and unknowns of a level that is factorised
 LARGEST_BAND = 10_000_000  # numbers in a band
-SHIFT = 1e-12  # of its diagonal, added to the coarsest matrix: rounding must not make it indefinite
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,20 +42,6 @@ class Level:
     smoother: np.ndarray  # (n, d, d) blocks of S
     prolongation: sp.bsr_matrix
     restriction: sp.bsr_matrix  # its transpose
-
-
-@dataclass(frozen=True, eq=False)
-class BandedCholesky:
-    """Factor of a symmetric positive definite matrix, its unknowns in the order of reverse Cuthill-McKee."""
-
-    factor: np.ndarray  # (band + 1, n), lower
-    order: np.ndarray  # (n) old index of each unknown
-
-    def solve(self, b: np.ndarray) -> np.ndarray:
-        """Return the solution (n) for a right-hand side (n)."""
-        x = np.empty_like(b)
-        x[self.order] = sl.cho_solve_banded((self.factor, True), b[self.order], check_finite=False)
-        return x
 
 
 class Multigrid:
@@ -70,13 +55,13 @@ class Multigrid:
         self._arena = FieldArena()
         self.levels: list[CycleLevel] = []
         host = []
-        while (found := factorise(matrix)) is None:
+        while not is_narrow(matrix.indptr, matrix.indices, matrix.blocksize[0]):
             unknowns = matrix.shape[0]
             level, matrix, modes = _coarsen(matrix, modes)
             if matrix.shape[0] >= unknowns:
                 raise np.linalg.LinAlgError("the aggregates are single nodes")
             host.append(level)
-        self.coarsest = found
+        self.coarsest = factorised(matrix)
         if host:
             self._upload(host, real)
             self.right, self.solution = self.levels[0].r, self.levels[0].other  # of `cycle`, rows padded to lanes
@@ -119,7 +104,7 @@ class Multigrid:
     @property
     def n_bytes(self) -> int:
         """Memory of all levels."""
-        return self.coarsest.factor.nbytes + sum(self._arena.bytes.values())
+        return self.coarsest.n_bytes + sum(self._arena.bytes.values())
 
     def cycle(self) -> None:
         """One V-cycle on the residual in `right`."""
@@ -127,7 +112,7 @@ class Multigrid:
             descend(level, *STEPS)
         rows = self._coarsest_rows
         b = self._coarsest_right.host[:, :rows].astype(np.float64).reshape(-1)
-        self._coarsest_solution.host[:, :rows] = self.coarsest.solve(b).reshape(-1, rows)
+        self._coarsest_solution.host[:, :rows] = self.coarsest.solution(b).reshape(-1, rows)
         for level in reversed(self.levels):
             ascend(level, *STEPS)
 
@@ -148,36 +133,16 @@ def block_rows(A: sp.bsr_matrix) -> np.ndarray:
     return owners(np.diff(A.indptr))
 
 
-def narrow_order(start: np.ndarray, column: np.ndarray, d: int) -> tuple[np.ndarray, np.ndarray, int] | None:
-    """Order (n) in which a matrix of (d, d) blocks has a narrow band, each node's place (n) in it, and that band.
+def is_narrow(start: np.ndarray, column: np.ndarray, d: int) -> bool:
+    """Whether a matrix of (d, d) blocks is factorised: if it is small, or has a narrow band in some order.
 
-    None if the band is not narrow and the matrix not small. start (n + 1), column: block rows, with all diagonal blocks.
+    start (n + 1), column: block rows, with all diagonal blocks.
     """
     n = len(start) - 1
     pattern = sp.csr_matrix((np.ones(len(column), dtype=np.int8), column, start), shape=(n, n))
-    order = reverse_cuthill_mckee(pattern, symmetric_mode=True)
-    place = np.empty(n, dtype=np.int64)
-    place[order] = np.arange(n)
-    band = (int(np.abs(place[owners(np.diff(start))] - place[column]).max()) + 1) * d - 1
-    if n * d > SMALL and (band > NARROW or (band + 1) * n * d > LARGEST_BAND):
-        return None
-    return order, place, band
-
-
-def factorise(A: sp.bsr_matrix) -> BandedCholesky | None:
-    """Factorise A if its band is narrow or A is small; otherwise return None."""
-    n, d = len(A.indptr) - 1, A.blocksize[0]
-    if (found := narrow_order(A.indptr, A.indices, d)) is None:
-        return None
-    order, place, band = found
-    i, j, axis = place[block_rows(A)], place[A.indices], np.arange(d)
-    row, column = np.broadcast_arrays((i[:, None] * d + axis)[:, :, None], (j[:, None] * d + axis)[:, None, :])
-    lower = row >= column
-    banded = np.zeros((band + 1, n * d))
-    banded[(row - column)[lower], column[lower]] = A.data[lower]
-    banded[0] *= 1.0 + SHIFT
-    factor = sl.cholesky_banded(banded, overwrite_ab=True, lower=True, check_finite=False)
-    return BandedCholesky(factor, (order[:, None].astype(np.int64) * d + axis).reshape(-1))
+    place = np.argsort(reverse_cuthill_mckee(pattern, symmetric_mode=True))
+    band = (int(np.abs(place[owners(np.diff(start))] - place[column]).max()) + 1) * d
+    return n * d <= SMALL or band <= NARROW and band * n * d <= LARGEST_BAND
 
 
 def _coarsen(A: sp.bsr_matrix, modes: np.ndarray) -> tuple[Level, sp.bsr_matrix, np.ndarray]:

@@ -1,7 +1,7 @@
 """Preconditioned conjugate gradients for A y = rhs on the free axes, with any preconditioner; `gauss_seidel` has its own.
 
 A is a `BlockCsr` that holds the whole system, plus coupling terms J^T D J, plus a border G^T s G of few dense rows.
-Used with `Jacobi` on CUDA and for bordered systems, with `BandedFactor` for slender bodies, and with `Volumes` for nearly
+Used with `Jacobi` on CUDA and for bordered systems, with `Factor` for slender bodies, and with `Volumes` for nearly
 incompressible ones. See `pcg_work` for where a solve stops.
 """
 

@@ -8,9 +8,9 @@ import scipy.sparse.linalg as spl
 
 from taisoft.backend.arrays import FieldArena
 from taisoft.linear.aggregation import MODES, rigid_aggregates, rigid_modes
-from taisoft.linear.banded import BandedPreconditioner
 from taisoft.linear.coarse_correction import CoarseCorrection
 from taisoft.linear.coarse_space import build_coarse_space
+from taisoft.linear.factor import Factor
 from taisoft.linear.hierarchy import build_hierarchy, rows_with_diagonals
 from taisoft.mesh.aggregates import aggregate
 from tests.linear.boxes import assembled, error, held_box
@@ -111,7 +111,7 @@ def test_iterations_hardly_grow_with_the_mesh():
 def test_a_narrow_band_is_factorised():
     with assembled(held_box((20, 3, 3))) as made:
         hierarchy = hierarchy_of(made)
-        assert isinstance(hierarchy, BandedPreconditioner)
+        assert isinstance(hierarchy, Factor)
         result = hierarchy.solve(made.model, made.A, made.work, 1e-8, 200)
         assert result.converged and result.iterations <= 2 and hierarchy.n_bytes > 8 * made.A.n_edges and error(made) < 1e-7
         m, A, w, f = made.model, made.A, made.work, made.free

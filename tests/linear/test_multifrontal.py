@@ -14,7 +14,9 @@ import scipy.linalg as sl
 import scipy.sparse as sp
 from scipy.sparse.csgraph import connected_components
 
+from taisoft.linear.factor import Factor, build_factor
 from taisoft.linear.multifrontal import Multifrontal
+from tests.backend.lanes import opened
 
 
 def chain(n: int) -> list[tuple[int, int]]:
@@ -76,15 +78,22 @@ class Pattern:
         mixed = np.random.default_rng(len(i)).permutation(len(i))
         return i[mixed], j[mixed]
 
-    def factorise(self, factor: Multifrontal, A: np.ndarray) -> None:
-        i, j = self.entries(factor)
-        factor.factorise(A[factor.order[i], factor.order[j]], factor.places(i, j))
+    def factorise(self, factor: Factor, A: np.ndarray) -> None:
+        row = np.repeat(np.arange(self.size // 3), np.diff(self.start))
+        blocks = A.reshape(-1, 3, self.size // 3, 3).swapaxes(1, 2)[row, self.column]
+        factor.fronts.factorise(blocks.reshape(-1)[factor.fronts.lower])
 
 
-def factorised(pattern: Pattern, A: np.ndarray) -> Multifrontal:
-    factor = Multifrontal(pattern.start, pattern.column)
+def factorised(pattern: Pattern, A: np.ndarray) -> Factor:
+    factor = build_factor(pattern.start, pattern.column, 3)
     pattern.factorise(factor, A)
     return factor
+
+
+@pytest.fixture(scope="module", autouse=True)
+def kernels():
+    with opened("f64"):
+        yield
 
 
 @pytest.fixture(params=GRAPHS)
@@ -103,17 +112,17 @@ def assert_close(found: np.ndarray, expected: np.ndarray) -> None:
 def test_it_solves(pattern):
     A = pattern.matrix(0)
     factor = factorised(pattern, A)
-    assert np.array_equal(factor.order[factor.place], np.arange(pattern.size))
+    assert np.array_equal(factor.fronts.order[factor.fronts.place], np.arange(pattern.size))
     for b in rights(pattern, 3).T:
         given = b.copy()
-        assert_close(factor.backward(factor.halfway(b)), np.linalg.solve(A, b))
+        assert_close(factor.solution(b), np.linalg.solve(A, b))
         assert np.array_equal(b, given)
 
 
 def test_substitutions_are_those_of_the_cholesky_factor(pattern):
     """Of each part; right sides with one entry fill few fronts."""
     A = pattern.matrix(1)
-    factor = factorised(pattern, A)
+    factor = factorised(pattern, A).fronts
     permuted = A[np.ix_(factor.order, factor.order)]
     for part in factor.parts:
         own = factor.unknowns_of(part)
@@ -122,11 +131,7 @@ def test_substitutions_are_those_of_the_cholesky_factor(pattern):
             found = right.copy()
             factor.forward(part, found)
             assert_close(found, sl.solve_triangular(L, right, lower=True))
-    y, L = rights(pattern, 1)[:, 0], np.linalg.cholesky(permuted)
-    expected = np.empty_like(y)
-    expected[factor.order] = sl.solve_triangular(L.T, y)
-    assert_close(factor.backward(y), expected)
-    assert factor.n_entries >= np.count_nonzero(L)
+    assert factor.n_entries >= np.count_nonzero(np.linalg.cholesky(permuted))
 
 
 def test_parts_are_those_of_the_graph(pattern):
@@ -142,12 +147,12 @@ def test_parts_are_those_of_the_graph(pattern):
 
 def test_one_factor_serves_many_matrices(pattern):
     """In any order, and after one that is refused."""
-    factor, b = Multifrontal(pattern.start, pattern.column), rights(pattern, 1)[:, 0]
+    factor, b = factorised(pattern, pattern.matrix(1)), rights(pattern, 1)[:, 0]
     for seed in (2, 3, 2):
         A = pattern.matrix(seed)
         pattern.factorise(factor, A)
         other = factorised(pattern, A)
-        assert np.array_equal(factor.backward(factor.halfway(b)), other.backward(other.halfway(b)))
+        assert np.array_equal(factor.solution(b), other.solution(b))
         A[-1, -1] *= -1.0
         with pytest.raises(np.linalg.LinAlgError, match="not positive definite"):
             pattern.factorise(factor, A)
@@ -172,10 +177,11 @@ def test_places_are_those_of_the_fronts(pattern):
     places = factor.places(i, j)
     assert len(np.unique(places)) == len(places)
     expected = np.full(len(i), -1)
-    for front in factor.fronts:
-        rows = [*range(front.first, front.end), *front.below]
-        for e in np.flatnonzero((j >= front.first) & (j < front.end)):
-            expected[e] = front.at + (j[e] - front.first) * front.size + rows.index(i[e])
+    for k, (w, b) in enumerate(zip(factor.width, factor.n_below)):
+        rows = [*range(factor.first[k], factor.first[k + 1]), *factor.row[factor.start[k] : factor.start[k + 1]]]
+        for e in np.flatnonzero((j >= factor.first[k]) & (j < factor.first[k + 1])):
+            row, column = rows.index(i[e]), j[e] - factor.first[k]
+            expected[e] = factor.at[k] + (column * w + row if row < w else w * w + column * b + row - w)
     assert np.array_equal(places, expected)
 
 
@@ -186,10 +192,10 @@ def test_merging_fronts_does_not_change_solutions(pattern, monkeypatch):
     for calls in (0.0, 1e3):
         monkeypatch.setattr(Multifrontal, "CALLS", calls)
         factors.append(factorised(pattern, A))
-    merged, apart, whole = (len(factor.fronts) for factor in factors)
-    assert apart >= merged >= whole == len(factors[0].parts)
+    merged, apart, whole = (len(factor.fronts.width) for factor in factors)
+    assert apart >= merged >= whole == len(factors[0].fronts.parts)
     if pattern.size == 3 * 64:
         assert apart > 10
     expected = np.linalg.solve(A, b)
     for factor in factors:
-        assert_close(factor.backward(factor.halfway(b)), expected)
+        assert_close(factor.solution(b), expected)
