@@ -2,9 +2,9 @@
 
 Where a benchmark has no small form, one is made here. Stand-ins take the place of what takes minutes or needs other programs:
 
-* implicit steps with contacts, which take a minute to compile: contact and crossings take explicit ones, paths has none, ipc
-  shows made-up rows, and so do order and launches;
-* child processes, whose work is done in this process: crossings, hard, many, paths, pictures, scaling;
+* implicit steps with contacts, which take a minute to compile: contact and crossings take explicit ones, ipc shows made-up rows,
+  and so do order and launches;
+* child processes, whose work is done in this process: crossings, hard, many, pictures, scaling;
 * the simulators of error and tolerance, by one with known errors; MuJoCo in elasticity; the display of window.
 
 The long runs do without them. The others run in test_cuda_check.py, test_document.py (figures, manual), test_peers.py and
@@ -36,8 +36,6 @@ from benchmarks import (
     laws,
     many,
     order,
-    path_runs,
-    paths,
     pictures,
     scaling,
     tolerance,
@@ -186,19 +184,6 @@ def order_small(patch, folder):
     replace(patch, order, measure_case=lambda case, *_: ([row], case.reference))
 
 
-def paths_small(patch, folder):
-    def here(what, name, arch, quick):
-        return path_runs.measure_cost(name, arch, 1, 4, 0.01)
-
-    replace(patch, paths, run_child=here, TABLES={"cost": (path_runs.BEAM,)})
-
-
-def paths_check(n):
-    """Where nothing can touch, the check has no launches and no fields, and changes nothing."""
-    (beam,) = n["cost"]
-    assert beam["same"] and set(beam["launches"].values()) == {0} and beam["field_bytes"] == 0 and len(beam["without"]) == 1
-
-
 def pictures_small(patch, folder):
     replace(patch, pictures, DEMOS={"hanging_beam": 0.5}, PICTURES=2, QUICK_ROUNDS=1)
     replace(patch, pictures, PictureProcess=picture_writer)
@@ -299,7 +284,6 @@ RUNS = {
     "laws": Small(QUICK, ("| psi of SNH | stable_neo_hookean |", "| psi of F | st_venant_kirchhoff |"), laws_small),
     "many": Small(QUICK, ("| sums | 6 |", "| killed and called again |", "| met |"), many_small, many_check),
     "order": Small(QUICK, ("| SNH | 1 | 1 | 11x2x2 | 220 | 108 | -2.26758 | 16.3 |",), order_small),
-    "paths": Small(("--what", "cost", "--quick"), ("## Cost", "| hanging_beam |", "| met |"), paths_small, paths_check),
     "pictures": Small(QUICK, ("| kernels |", "| PNG |", "| hanging_beam |"), pictures_small, pictures_check),
     "regression": Small(("--case", "search, two"), ("| search, two cubes | f32 |", "nothing has changed")),
     "robots": Small(QUICK, ("| 2 | 8 |", "weak, amplitude 0.", "| of it MuJoCo and exchange |")),
@@ -324,7 +308,7 @@ WHOLE = {"startup": Small(QUICK)} | {name: Small(run.arguments) for name, run in
     "name, small", [*RUNS.items(), *(pytest.param(*one, marks=pytest.mark.long, id=f"{one[0]}-whole") for one in WHOLE.items())]
 )
 def test_a_benchmark_runs(name, small, monkeypatch, tmp_path, capsys):
-    if name in ("crossings", "ipc", "paths"):
+    if name in ("crossings", "ipc"):
         pytest.importorskip("ipctk")
     small.reduce(monkeypatch, tmp_path)
     out = tmp_path / "new" / f"{name}.json"

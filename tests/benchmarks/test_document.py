@@ -27,7 +27,7 @@ from taisoft.errors import OutputError
 from taisoft.machine import summarise
 
 WRITING = (  # benchmarks with --out FILE.json; those without have no file of that name to refuse
-    "collision contact crossings elasticity error hard ipc launches order paths peers pictures scaling startup tolerance window"
+    "collision contact crossings elasticity error hard ipc launches order peers pictures scaling startup tolerance window"
 ).split()
 TEXT = "before\n<!-- begin fake -->\nold\n<!-- end fake -->\nafter\n"
 
