@@ -14,7 +14,6 @@ import taisoft as ts
 from taisoft.cli.scene_file import load_module, shipped_files
 from taisoft.errors import SimulationError
 
-from .contact_states import cloth, rubber, slabs
 from .crossing_heaps import make_heap
 from .hard_cases.case import EXPLICIT, IMPLICIT, Session
 from .hard_cases.contact import on_slope
@@ -114,12 +113,25 @@ def moving(scene: ts.Scene, velocity, **places) -> ts.Scene:
     return scene
 
 
+def cloth(height: float) -> ts.Scene:
+    """A cloth, 2 mm thick, above a sphere."""
+    scene = ts.Scene(gravity=DOWN)
+    material = ts.Material(young=1e5, poisson=0.3, density=500.0, friction=0.3)
+    scene.add_body(ts.sheet_mesh((20, 20), (0.5, 0.002, 0.5)), material, name="cloth", position=(0, height, 0))
+    scene.add_obstacle(ts.Sphere((0, 0, 0), 0.1), name="sphere", friction=0.3)
+    return scene
+
+
 def two_slabs(upper: float, lower: float) -> ts.Scene:
     """A slab falls on another one, turned by 45 degrees; young: of each [Pa]."""
-    scene = slabs()
-    for body in scene.bodies:
-        body.material = rubber(young={"upper": upper, "lower": lower}[body.name], density=1500.0, friction=0.1)
-    return moving(scene, (0, -1, 0), upper=(0, 0.0752, 0), lower=(0, 0.0251, 0))
+    scene, mesh = ts.Scene(gravity=DOWN), ts.box_mesh((12, 1, 12), (1.0, 0.05, 1.0))
+    c = np.sqrt(0.5)
+    turned = ts.TetMesh(mesh.vertices @ np.array([[c, 0, c], [0, 1, 0], [-c, 0, c]]).T, mesh.tets)
+    for name, one, young, height in (("lower", mesh, lower, 0.0251), ("upper", turned, upper, 0.0752)):
+        material = ts.Material(young=young, poisson=0.4, density=1500.0, friction=0.1)
+        scene.add_body(one, material, name=name, position=(0, height, 0), velocity=(0, -1, 0))
+    scene.add_obstacle(ts.HalfSpace((0, 0, 0), (0, 1, 0)), name="plane", friction=0.1)
+    return scene
 
 
 def twisted_mat(cells: int) -> ts.Scene:

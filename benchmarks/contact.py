@@ -1,10 +1,6 @@
 """Contact: solvers on the problems of whole scenes, colourings, cost of steps, problems of rigid scenes.
 
 taisoft bench contact [--quick] [--arch cpu|cuda] [--out FILE.json]
-taisoft bench contact --capture DIR [--baseline FOLDER] [--only SCENE] [--quick]
-taisoft bench contact --replay DIR [--baseline FOLDER] [--only SCENE] [--out FILE.json]
-taisoft bench contact --drops [--baseline FOLDER] [--only SCENE] [--out FILE.json] [--quick]
-taisoft bench contact --free [--baseline FOLDER] [--only CASE] [--out FILE.json] [--quick]
 
 Scenes are demos, in f32; figure numbers are those of the report, which `taisoft bench report` draws. In each frame of an explicit
 run every solver solves the contact problem in turn to a residual of 1e-4, from the impulses of the previous step and from zero.
@@ -12,23 +8,10 @@ Residuals are computed in NumPy. A solve's time includes its colouring and exclu
 on all if stated. Numbers are medians with their range in brackets; spread is the interquartile range over the median. Exit
 status: 0, or 1 if a limit is not met. --quick has one scene, few frames, and no limits. A full run takes about six minutes on two
 cores.
-
---capture runs twelve scenes and saves the states before every fifth implicit step and before the ten slowest. --replay solves
-these steps again in f32 and f64 to 1e-4, divided into halves if that does not converge, and compares them with the same step
-solved to 1e-8 (errors over the mean surface edge). --baseline: folder of another version, which captures or also solves the
-states. N: Newton iterations (matrix assemblies) of the first attempt; launches and ms: of all attempts. Scenes whose meshes are
-absent are left out. Capturing takes about ten minutes, replaying ten per version.
-
---drops runs bodies that fall and come to rest, including four real meshes: iterations per step, unconverged steps and times, also
-of the older version. It takes two minutes, with version 0.1 six.
-
---free runs steps without contacts, of beams with and without inverted tets, and statics, with the versions in turn; only steps
-and solves that converge in every version count. It takes two minutes, with version 0.1 six.
 """
 
 import sys
 from contextlib import closing
-from pathlib import Path
 
 import numpy as np
 
@@ -48,7 +31,6 @@ from .contact_colouring import (
     crossover_text,
     measure_crossover,
 )
-from .contact_drops import DROPS
 from .contact_runs import (
     COLD,
     GOAL,
@@ -65,8 +47,6 @@ from .contact_runs import (
     open_scene,
     to_impulses,
 )
-from .contact_states import SCENES
-from .contact_versions import FREE_NAMES, capture, drops, free, replay
 from .document import Document, Limit, begin, ms, ranged, table, timed_cells, timed_limit
 from .runner import REST, make_parser, parse_options
 
@@ -222,29 +202,7 @@ def main(argv=None) -> int:
     """Measure and print. Raises OutputError, or SimulationError if the arch is not available."""
     parser = make_parser("contact", __doc__)
     parser.add_argument("--quick", action="store_true", help="one scene, few frames and sizes, no limits")
-    parser.add_argument("--capture", type=Path, metavar="DIR", help="save states of implicit steps with contacts")
-    parser.add_argument("--replay", type=Path, metavar="DIR", help="solve such states again")
-    parser.add_argument("--drops", action="store_true", help="run bodies that fall in implicit steps")
-    parser.add_argument("--free", action="store_true", help="run steps without contacts, and statics")
-    parser.add_argument("--baseline", type=Path, metavar="FOLDER", help="another version")
-    parser.add_argument("--only", action="append", metavar="SCENE", help="only this scene; repeatable")
     options = parse_options(parser, argv)
-    known = DROPS if options.drops else FREE_NAMES if options.free else SCENES
-    if unknown := [name for name in options.only or () if name not in known]:
-        parser.error(f"argument --only: '{unknown[0]}' is none of {', '.join(known)}")
-    if options.capture:
-        for line in capture(options.capture, options.baseline, options.only, options.quick):
-            print(line, flush=True)
-        return 0
-    if options.replay:
-        document, numbers = begin("Captured steps with contacts", options.arch)
-        rows, limits = replay(options.replay, options.baseline, options.only, document)
-        return document.finish(options, numbers | {"rows": rows}, limits)
-    if options.drops or options.free:
-        title, run = ("Bodies that fall in implicit steps", drops) if options.drops else ("Without contacts", free)
-        document, numbers = begin(title, options.arch, "f32")
-        runs, limits = run(options.baseline, options.only, options.quick, document)
-        return document.finish(options, numbers | {"runs": runs}, limits)
     document, numbers = begin("Contact", options.arch, "f32")
     compiled = compile_clock()
     found = measure(options.quick, options.arch, document)

@@ -14,7 +14,6 @@ import warnings
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 
 import taichi as ti
@@ -22,7 +21,6 @@ import taichi as ti
 import taisoft
 from taisoft.backend.runtime import compile_clock
 from taisoft.errors import SimulationError
-from taisoft.output.files import make_folder
 from taisoft.output.tables import require_matplotlib
 from taisoft.simulator import Simulator
 
@@ -229,31 +227,3 @@ def print_result(result) -> None:
 def parse_result(line: str):
     """The result in a line of a child's output, None in other lines."""
     return json.loads(line.removeprefix(RESULT)) if line.startswith(RESULT) else None
-
-
-@dataclass(frozen=True)
-class Version:
-    """A version of taisoft in a folder. cache: folder of its compiled kernels, None for the default."""
-
-    folder: Path
-    cache: Path | None = None
-
-    def run(self, program: Path, *task: str | int | Path) -> list[str]:
-        """The output lines of a program. Raises SimulationError if it fails."""
-        what = f"{self.folder}: task {' '.join(map(str, task))}"
-        return run_python(what, program, *task, folder=self.folder, cache=self.cache)
-
-    def files(self) -> set[Path]:
-        """Files in the cache."""
-        return {path for path in self.cache.rglob("*.tic*") if path.is_file()}
-
-
-def version_in(folder: Path) -> Version:
-    """The version in a folder; other versions than this keep their kernel cache there."""
-    folder = folder.resolve()
-    return Version(folder, None if folder == HERE else make_folder(folder / ".cache"))
-
-
-def versions_beside(baseline: Path | None) -> dict[str, Version]:
-    """This version and, given a folder, an older one."""
-    return {"this": version_in(HERE)} | ({} if baseline is None else {"older": version_in(baseline)})

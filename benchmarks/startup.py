@@ -19,6 +19,7 @@ import resource
 import sys
 import tempfile
 import time
+from dataclasses import dataclass
 from functools import reduce
 from operator import getitem
 from pathlib import Path
@@ -28,7 +29,7 @@ import numpy as np
 from taisoft.output.tables import markdown
 
 from .document import Limit, begin, check_out
-from .runner import HERE, Version, make_parser, progress
+from .runner import HERE, make_parser, progress, run_python
 
 CHILD = Path(__file__).with_name("startup_child.py")
 SIZES = {"beam": (3, 4, 5, 6), "cube": (4, 5, 6, 7), "plane": (4, 5, 6, 7)}  # cells, and those of another size in each round
@@ -56,6 +57,23 @@ TASKS = {
     "surfaces": ((6, 7, 21, 22), (6, 7, 21, 22)),
     "keep": ((22, 4), (6, 2)),
 }
+
+
+@dataclass(frozen=True)
+class Version:
+    """A version of taisoft in a folder. cache: folder of its compiled kernels."""
+
+    folder: Path
+    cache: Path
+
+    def run(self, program: Path, *task: str | int | Path) -> list[str]:
+        """The output lines of a program. Raises SimulationError if it fails."""
+        what = f"{self.folder}: task {' '.join(map(str, task))}"
+        return run_python(what, program, *task, folder=self.folder, cache=self.cache)
+
+    def files(self) -> set[Path]:
+        """Files in the cache."""
+        return {path for path in self.cache.rglob("*.tic*") if path.is_file()}
 
 
 def run_child(version: Version, *task: str | int) -> tuple[dict, dict]:
