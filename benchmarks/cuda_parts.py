@@ -13,8 +13,8 @@ from taisoft.dynamics.schemes import EXPLICIT
 from taisoft.errors import TaisoftError
 from taisoft.scene.scene import Scene
 
+from .beam import MARGIN, beam_scene
 from .contact_colouring import measure_crossover
-from .elasticity_runs import MARGIN, beam_scene
 from .programs import own
 from .programs.session import Setting
 from .runner import patched, print_result, warm_up

@@ -15,8 +15,8 @@ from taisoft.dynamics.schemes import EXPLICIT
 from taisoft.machine import Timing, summarise
 from taisoft.output.tables import percent, spread_of
 
+from .beam import LAWS, beam_scene, explicit_steps, n_tets
 from .document import Limit, table
-from .elasticity_runs import LAWS, beam_scene, n_tets, steps_within_limit
 from .exact_path import SAMPLE
 from .runner import warm_up
 from .timed_run import advance
@@ -63,7 +63,7 @@ def measure_costs(cells, precision: str, arch: str, repeats: int, laws=tuple(LAW
     tets = n_tets(cells)
     guess = GUESSED_SECONDS_PER_TET * tets + GUESSED_LAUNCHES[arch]
     steps = min(MAX_STEPS, max(1, round(SAMPLE_SECONDS / guess)))
-    dt = min(SAMPLE / steps_within_limit(cells), LONGEST_FALL / steps)
+    dt = min(SAMPLE / explicit_steps(beam_scene(cells)), LONGEST_FALL / steps)
     with contextlib.ExitStack() as stack:
         pairs = []
         for integrator in integrators:

@@ -7,7 +7,7 @@ of order 8) integrates the ordinary differential equations at two tolerances; th
 uncertainty.
 
 The law has no barrier against inversion: from about t = 0.8 s the beam folds at the clamp and tets invert. The path remains well
-defined (see `convergence` in the data) but unphysical, so errors are also given up to t = 0.8 s.
+defined (see `convergence` in the data) but unphysical.
 
 `python -m benchmarks.exact_path` integrates all meshes (about a minute) and writes data/falling_beam_svk.npz.
 """
@@ -31,7 +31,6 @@ GRAVITY = 9.8  # m/s^2, along -y
 MESHES = ((12, 3, 3), (24, 6, 6), (48, 12, 12))  # 540, 4,320, 34,560 tets
 SAMPLE = 0.01  # s between stored points of the path
 SECONDS = 1.0
-FOLDING_STARTS = 0.8  # s
 DATA = Path(__file__).parent / "data" / "falling_beam_svk.npz"
 
 
@@ -77,29 +76,15 @@ def integrate(beam: FallingBeam, tolerance: float, seconds: float = SECONDS, poi
 
 @dataclass(frozen=True)
 class ExactPath:
-    """Path of the tip (mean of the end face's nodes): t (k,) [s], path (k,3) [m], and its convergence.
+    """Path of the tip (mean of the end face's nodes), path (k,3) [m] every SAMPLE, and its convergence.
 
     excursion: largest distance of the tip from its start [m]. convergence (k,): difference to the path at the looser
     tolerance over the excursion, an upper bound of the path's error.
     """
 
-    t: np.ndarray
     path: np.ndarray
     excursion: float
     convergence: np.ndarray
-
-    def error(self, t, path, until: float = SECONDS) -> float:
-        """Largest distance of `path` (k,3) [m] to this path over the times t <= until, over the excursion.
-
-        t (k,) [s] must be multiples of SAMPLE within the stored second; ValueError otherwise.
-        """
-        t, path = np.asarray(t, float), np.asarray(path, float)
-        index = np.rint(t / SAMPLE).astype(int)
-        off = np.flatnonzero((np.abs(t - index * SAMPLE) > 1e-9) | (index < 0) | (index >= len(self.t)))
-        if len(off):
-            raise ValueError(f"time {off[0]}, {t[off[0]]} s, is not a multiple of {SAMPLE} s between 0 and {self.t[-1]} s")
-        use = t <= until + 1e-9
-        return float(np.linalg.norm(path[use] - self.path[index[use]], axis=1).max() / self.excursion)
 
 
 def load_exact(cells) -> ExactPath:
@@ -109,8 +94,7 @@ def load_exact(cells) -> ExactPath:
         if f"path_{key}" not in data:
             raise ValueError(f"no exact path is stored for the mesh {key}; stored are {', '.join(map(_key, MESHES))}")
         path, convergence = data[f"path_{key}"], data[f"convergence_{key}"]
-    times = np.arange(len(path)) * SAMPLE
-    return ExactPath(times, path, float(np.linalg.norm(path - path[0], axis=1).max()), convergence)
+    return ExactPath(path, float(np.linalg.norm(path - path[0], axis=1).max()), convergence)
 
 
 def _key(cells) -> str:

@@ -20,10 +20,9 @@ from taisoft.scene.scene import Scene
 from .collision_cases import DEEP_PENETRATION, SHEET, cubes_setup
 from .collision_runs import Rig
 from .contact_runs import SETTINGS
-from .elasticity_runs import LAWS
 from .hard_cases.contact import on_slope
 from .hard_cases.shapes import SNH, G, box
-from .reference_cases.record import face
+from .reference_cases.record import LAWS, face
 from .runner import timed
 
 # settings of a reference: fraction of the step, and tolerances that hold even in the step in which sliding ends

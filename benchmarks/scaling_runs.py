@@ -33,10 +33,10 @@ from taisoft.machine import Timing, summarise
 from taisoft.output.report import peak_memory
 from taisoft.scene.scene import Scene
 
+from .beam import MARGIN, beam_scene, n_tets
 from .collision_cases import pile_setup, two_cubes
 from .collision_runs import Rig
 from .contact_runs import explicit_places
-from .elasticity_runs import MARGIN, beam_scene, n_tets
 from .elasticity_steps import LONGEST_FALL, MAX_STEPS, SAMPLE_SECONDS
 from .runner import Stopwatch, clock, patched, repeated, timed, warm_up
 from .scaling_bytes import floor_bytes, group_bytes

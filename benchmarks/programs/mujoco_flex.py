@@ -23,21 +23,25 @@ All vertices of a flex meet the ground, also inner ones; two flexes meet by tria
 """
 
 import warnings
-from dataclasses import replace
 
 import numpy as np
 
-from taisoft.errors import SceneError, SimulationError
+from taisoft.errors import SimulationError
 
-from ..exact_path import FOLDING_STARTS, POISSON, SAMPLE, SECONDS, load_exact
-from ..works.references import MUJOCO, NEWTON, Model, masses, observed
-from ..works.scenes import Body, Work, hanging_beam
+from ..exact_path import POISSON, SAMPLE
+from ..works.references import MUJOCO, NEWTON, Model, masses
+from ..works.scenes import Body, Work
 from .session import Session, Setting
 
 NAME, MODEL = "MuJoCo", MUJOCO
 NEO_HOOKEAN = NEWTON  # the same law and masses as Newton's vertex block descent
-BEAM_INTEGRATORS = {"euler": "EULER", "euler_staggered": "EULER", "rk4": "RK4", "discrete": "DISCRETE"}  # MuJoCo's constants
-INTEGRATORS = BEAM_INTEGRATORS | {"implicitfast": "IMPLICITFAST"}
+INTEGRATORS = {  # MuJoCo's constants
+    "euler": "EULER",
+    "euler_staggered": "EULER",
+    "rk4": "RK4",
+    "discrete": "DISCRETE",
+    "implicitfast": "IMPLICITFAST",
+}
 # For each mesh of the beam the smallest number of steps within 10 ms that is stable for 1 s, (Euler, RK4): one fewer diverges.
 STABLE_STEPS = {(12, 3, 3): (2, 2), (24, 6, 6): (5, 3), (48, 12, 12): (11, 7)}
 STIFF_STEPS = {1e8: (20, 15), 1e9: (62, 45)}  # of the coarse beam, by Young's modulus [Pa]: about the least that both bear
@@ -202,36 +206,3 @@ class Run(Session):
         now = self.work.start.copy()
         now[self.free] += data.qpos.reshape(-1, 3)
         return now
-
-
-def run_mujoco(cells, integrator: str, dt: float, seconds: float = SECONDS) -> dict:
-    """Let the beam of exact_path.py fall for `seconds` [s] in steps of `dt` [s], a divisor of 10 ms.
-
-    cells: a mesh of exact_path.MESHES. integrator: one of BEAM_INTEGRATORS.
-    Returns a dict: path (k,3) [m] of the tip every 10 ms, t (k,) [s], error (see ExactPath.error), error_unfolded
-    (the same up to t = 0.8 s), seconds_per_simulated_second, compile_seconds.
-    Raises SceneError for arguments outside these rules, SimulationError where the run diverges.
-    """
-    if integrator not in BEAM_INTEGRATORS:
-        raise SceneError(f"integrator must be one of {', '.join(BEAM_INTEGRATORS)}, not {integrator!r}")
-    steps = round(SAMPLE / dt) if dt > 0 else 0
-    if steps < 1 or abs(steps * dt - SAMPLE) > 1e-9 * SAMPLE:
-        raise SceneError(f"dt must divide the {SAMPLE} s between two samples, not {dt} s")
-    samples = round(seconds / SAMPLE)
-    if not 1 <= samples <= round(SECONDS / SAMPLE) or abs(samples * SAMPLE - seconds) > 1e-9:
-        raise SceneError(f"seconds must be a multiple of {SAMPLE} s up to {SECONDS} s, not {seconds} s")
-    exact, work = load_exact(cells), replace(hanging_beam(cells), seconds=seconds)
-    session = Run(work, Setting(NAME, MODEL, integrator, steps))
-    try:
-        positions, wall = session.run(follow=True)
-    except SimulationError as error:
-        raise SimulationError(f"MuJoCo's {integrator} with dt = {dt:g} s diverges on the mesh {work.cells}: {error}") from None
-    path, times = observed(work, positions, masses(work, MODEL)), np.arange(len(positions)) * SAMPLE
-    return {
-        "path": path,
-        "t": times,
-        "error": exact.error(times, path),
-        "error_unfolded": exact.error(times, path, until=FOLDING_STARTS),
-        "seconds_per_simulated_second": wall / seconds,
-        "compile_seconds": session.build_seconds,
-    }

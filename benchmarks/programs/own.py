@@ -5,7 +5,7 @@ import numpy as np
 import taisoft as ts
 from taisoft.scene.scene import Scene
 
-from ..elasticity_runs import lasting_steps
+from ..beam import lasting_steps
 from ..exact_path import DENSITY, POISSON, SAMPLE
 from ..runner import warm_up, without_warnings
 from ..timed_run import TimedRun, advance
@@ -41,7 +41,7 @@ def settings(work: Work, arch: str = "cpu") -> list[Setting]:
     """Explicit steps at the largest stable dt and finer, implicit ones of 10 ms; W1 also with MuJoCo's law."""
     model = MUJOCO if work.cells is not None else TAISOFT
     with without_warnings():
-        least, _ = lasting_steps(make_scene(work, model), "velocity_verlet", arch, work.seconds)
+        least = lasting_steps(make_scene(work, model), "velocity_verlet", arch, work.seconds)
     f32, f64 = {"precision": "f32", "arch": arch}, {"precision": "f64", "arch": arch}
     finer = FINER if work.cells is not None else FINER[:3] if work.kind == "path" else FINER[:1]
     explicit = [Setting(NAME, model, "velocity_verlet", k * least, f32) for k in finer]

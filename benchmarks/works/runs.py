@@ -1,6 +1,6 @@
 """All programs' settings on one work, in rounds, so that a slow minute of the machine affects all; and the fastest."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict, dataclass, field
 from datetime import datetime
 from types import ModuleType
@@ -11,8 +11,7 @@ from taisoft.errors import TaisoftError
 from taisoft.machine import Timing, summarise
 from taisoft.study.results import front
 
-from ..elasticity_runs import TAISOFT as OWN
-from ..elasticity_runs import repeat_short
+from ..programs.own import NAME as OWN
 from ..programs.session import Setting
 from ..runner import progress
 from .evaluation import Verdict, evaluate
@@ -20,6 +19,7 @@ from .references import MODELS
 from .scenes import Work
 
 KEPT = ("rounds", "build_seconds", "unconverged", "failure")  # attributes of a row that its record has unchanged
+ROUND_SECONDS, ROUND_RUNS = 0.3, 10  # a round repeats a run until this wall time or this number is reached
 ENOUGH_SECONDS, ENOUGH_BUILDING = 10.0, 20.0  # wall time of a run and of its building from which it is not repeated
 
 
@@ -121,6 +121,21 @@ def _round(row: Row, program: ModuleType) -> np.ndarray | None:
         row.failure = str(error)
         return None
     return positions
+
+
+def repeat_short(run: Callable[[], float]) -> Iterator[float]:
+    """Repeat run() until ROUND_SECONDS or ROUND_RUNS is reached; yields its seconds."""
+    total, count = 0.0, 0
+    while count == 0 or (total < ROUND_SECONDS and count < ROUND_RUNS):
+        seconds = run()
+        total, count = total + seconds, count + 1
+        yield seconds
+
+
+def time_ratio(slow: Row, fast: Row) -> Timing | None:
+    """Ratio of the times of `slow` and `fast` from the medians of each round; None without runs."""
+    pairs = list(zip(slow.rounds, fast.rounds))
+    return summarise(np.median(a) / np.median(b) for a, b in pairs) if pairs else None
 
 
 def fastest_within(rows: list[Row], error: float) -> Row | None:

@@ -6,10 +6,9 @@ from taisoft.output.tables import markdown, percent, require_matplotlib, save, s
 from taisoft.study.results import front
 
 from ..document import Limit
-from ..elasticity_runs import time_ratio
 from ..programs import own
 from ..programs.tried import TRIED
-from .runs import Row, fastest_standing, fastest_within
+from .runs import Row, fastest_standing, fastest_within, time_ratio
 
 LEVELS = (1e-2, 1e-3, 1e-4, 1e-5)  # errors at which W1 is compared
 FASTER = 4.0  # times the best peer, on W1 at equal error
