@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 import taisoft as ts
-from benchmarks.numpy_raster import rasterise
 from taisoft.cli.scene_file import load_scene
 from taisoft.mesh.placing import FROM_Y_UP
 from taisoft.output.viewpoint import BORDER, EDGE, FILL, WHOLE, Viewpoint, framed_points, start_positions
+from tests.view.numpy_raster import rasterise
 
 SIZE = (320, 180)
 

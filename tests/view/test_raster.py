@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from benchmarks.numpy_raster import averaged, rasterise
 from taisoft.backend.runtime import open_runtime
 from taisoft.errors import OutputError
 from taisoft.view.raster import Raster
 from taisoft.view.shading import N_ATTRIBUTES, SAMPLES, TILE
+from tests.view.numpy_raster import averaged, rasterise
 
 NEAR = 0.5
 SHAPE = (3 * TILE + 10, 4 * TILE + 6)  # samples; the last tiles are cut off

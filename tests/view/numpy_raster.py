@@ -1,4 +1,4 @@
-"""The z-buffer rasteriser of earlier versions, in NumPy: what `taisoft bench pictures` compares with, and the tests' reference.
+"""A z-buffer rasteriser in NumPy, the reference of that by kernels.
 
 Triangles are cut into spans of pixel rows, and spans into pixels whose centre is inside. The nearest triangle of each pixel is
 drawn, with its corner colours interpolated in perspective. The z-buffer holds 1/depth, which is linear in the picture.
