@@ -13,6 +13,7 @@ from taisoft.dynamics.contact import TOLERANCE as CONTACT_TOLERANCE
 from taisoft.dynamics.implicit_stages import DEFAULT_TOLERANCE
 from taisoft.errors import SimulationError, no_memory
 from taisoft.estimation.comparison import shared_nodes
+from taisoft.estimation.first_choice import STABLE_FRACTION
 from taisoft.scene.refine import refined, with_order
 from taisoft.scene.rigid import RigidBody
 from taisoft.scene.scene import Body, Scene
@@ -22,7 +23,6 @@ if TYPE_CHECKING:
     from taisoft.simulator import Simulator
 
 MIN_STEPS = 32  # of a run whose error is estimated by larger steps
-STABLE_FRACTION = 0.9  # of the stable dt, for explicit steps of a twin
 TIGHTER = 0.1  # a twin's tolerances over those of the run; much less takes many iterations, and in f32 meets rounding
 REFINED, ORDER = "refined", "order"  # meshes of a twin, besides a scene
 MESHES = (REFINED, ORDER)

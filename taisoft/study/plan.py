@@ -15,6 +15,7 @@ from functools import cache
 
 from taisoft.dynamics.schemes import EXPLICIT, INTEGRATORS
 from taisoft.errors import SceneError, TaisoftError, reworded
+from taisoft.estimation.first_choice import STABLE_FRACTION
 from taisoft.estimation.order import nominal_order
 from taisoft.scene.scene import Scene
 from taisoft.settings import WITH_MULTIPLIERS, check_settings, kept_by_multipliers
@@ -28,7 +29,6 @@ MAX_FRAMES = 48  # at which runs are compared
 MIN_FRAMES = 4
 MAX_DENOMINATOR = 10_000  # of the ratio of two time steps; above it they have no common multiple
 DT_RATIO = 8  # the study's smallest dt over the reference's
-STABLE_FRACTION = 0.9  # of the stable step, for a reference's coarser run
 EXPLICIT_DT_RATIO = 16  # explicit references may use steps this many times smaller than requested: they are cheap
 
 Variant = Callable[[int, int | None], Scene]  # (refine, order) -> scene
