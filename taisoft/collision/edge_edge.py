@@ -153,12 +153,14 @@ def _max_depth(s: ti.template(), t, k, u, m, f, g, la, lb):
 
 
 @ti.func
-def edge_contact(s: ti.template(), t, k, u, m, margin, out: ti.template(), start, end):
+def edge_contact(s: ti.template(), t, k, u, m, times, margin, out: ti.template(), start, end):
     """Write the contact of edge k of triangle t with edge m of triangle u if they cross now, or cross and penetrate at the end of
-    the step, as a fold that slides over an edge does. The gap is that of the same points at the start. Return the new count."""
+    the step, as a fold that slides over an edge does. The gap is that of the same points at the start. Return the new count.
+
+    times: which of both is tested, as `possible_crossings` returns it."""
     at = start
     for at_end in range(2):
-        valid = int(at == start)
+        valid = int(at == start) & (times >> at_end)
         if at_end == 1 and valid == 1:
             valid = _moves_enough(s, t, k, u, m)
         if valid == 1:
@@ -219,28 +221,50 @@ def edge_contact(s: ti.template(), t, k, u, m, margin, out: ti.template(), start
 
 @ti.func
 def crossable(a, b):
-    """Which edges of a triangle can cross an edge, in bits 0-2: one is sharp, the other sharp or flat. a, b: bits of
-    `mark_sharp_edges`, those of the edge in bits 0 and 3."""
-    return ti.select(a & 1, b >> 3, 0) & 7 | ti.select(a & 8, b, 0) & 7
+    """Which edges k and m of two triangles can cross, in bits 3 k + m: one is sharp, the other sharp or flat. a, b: bits of
+    `mark_sharp_edges`."""
+    pairs = 0
+    for k in ti.static(range(3)):
+        pairs |= (ti.select((a >> k) & 1, b >> 3, 0) & 7 | ti.select((a >> k) & 8, b, 0) & 7) << 3 * k
+    return pairs
 
 
 @ti.func
-def may_cross(s: ti.template(), t, k, u, m):
-    """Whether the lines of two edges, neither nearly parallel, are nearest between their ends or slightly beyond, at the start or
-    at the end of the step: what `edge_contact` needs, without roots and quotients."""
-    least, slack = ti.cast(0.9 * CROSSING**2, ti.f64), ti.cast(MAX_OVERHANG + 1e-3, ti.f64)
-    p, q, w = corner(s, t, k + 1) - corner(s, t, k), corner(s, u, m + 1) - corner(s, u, m), corner(s, u, m) - corner(s, t, k)
-    found = False
-    for at_end in range(2):
-        if at_end == 1:
-            p += _move(s, t, k, 1.0) - _move(s, t, k, 0.0)
-            q += _move(s, u, m, 1.0) - _move(s, u, m, 0.0)
-            w += _move(s, u, m, 0.0) - _move(s, t, k, 0.0)
-        pp, pq, qq, pw, qw = p.dot(p), p.dot(q), q.dot(q), p.dot(w), q.dot(w)
-        square = pp * qq - pq * pq
-        f, g = qq * pw - pq * qw, pq * pw - pp * qw  # times the square
-        inner = ti.min(f, square - f, g, square - g) >= -slack * square
-        found = found or (inner and square > least * pp * qq)
+def _pass_between_ends(p, q, w, slack):
+    """1 if two lines, not nearly parallel, are nearest between the ends of their edges p and q, or beyond by `slack` of the edge.
+    w: from the start of p to that of q."""
+    pp, pq, qq, pw, qw = p.dot(p), p.dot(q), q.dot(q), p.dot(w), q.dot(w)
+    square = pp * qq - pq * pq
+    f, g = qq * pw - pq * qw, pq * pw - pp * qw  # times the square
+    most = (1.0 + 2.0 * slack) * square
+    inner = int(ti.abs(2.0 * f - square) <= most) & int(ti.abs(2.0 * g - square) <= most)
+    return inner & int(square > ti.cast(0.9 * CROSSING**2, ti.f64) * pp * qq)
+
+
+@ti.func
+def _may_face(p, q, w, n_t, n_u, square_range):
+    """1 if the sides of two such edges to which their normals n_t and n_u point may face each other, with a gap whose square is
+    at most `square_range`, or a depth that counts."""
+    c = p.cross(q)
+    of_t, of_u, below, square = c.dot(n_t), c.dot(n_u), c.dot(w), c.dot(c)
+    deepest = ti.cast(0.2501, ti.f64) * ti.min(p.dot(p), q.dot(q))  # see _max_depth
+    most = ti.select(below * (of_u - of_t) > 0.0, deepest, square_range)
+    return int(of_t * of_u <= ti.cast(TINY, ti.f64) * square) & int(below * below <= most * square)
+
+
+@ti.func
+def possible_crossings(s: ti.template(), t, k, u, m, margin):
+    """When `edge_contact` may find a contact, without quotients: bit 0 at the start, bit 1 at the end of the step."""
+    a, a1, b, b1 = s.triangle[t, k], s.triangle[t, (k + 1) % 3], s.triangle[u, m], s.triangle[u, (m + 1) % 3]
+    p, q, w = s.x[a1] - s.x[a], s.x[b1] - s.x[b], s.x[b] - s.x[a]
+    dp, dq, dw = s.move[a1] - s.move[a], s.move[b1] - s.move[b], s.move[b] - s.move[a]
+    p1, q1, w1, tiny = p + dp, q + dq, w + dw, ti.cast(1e-6, ti.f64)
+    found = _pass_between_ends(p, q, w, MAX_OVERHANG + tiny) | _pass_between_ends(p1, q1, w1, tiny) << 1
+    if found != 0:
+        n_t, n_u = edge_normal(s, t, k), edge_normal(s, u, m)
+        reach = (1.0 + tiny) * margin + dw.norm() + (1.0 + 2.0 * ti.cast(MAX_OVERHANG, ti.f64)) * (dp.norm() + dq.norm())
+        now = _may_face(p, q, w, n_t, n_u, reach * reach)
+        found &= now | _may_face(p1, q1, w1, n_t, n_u, tiny * tiny * (p.dot(p) + q.dot(q))) << 1
     return found
 
 
@@ -285,16 +309,19 @@ class Edges(Visitor):
     def visit(self, surface: ti.template(), t, q, entry: ti.template(), first, last, out: ti.template(), start, end):
         """See Visitor."""
         at = start
-        for e in range(3 * (last - first)):
-            u, k = entry[first + e // 3], e % 3
-            edges = crossable(surface.sharp[t] >> k, surface.sharp[u])
-            for m in range(ti.select(edges != 0, 3, 0)):
-                if (edges >> m) & 1:
-                    if may_cross(surface, t, k, u, m):
-                        t1, k1, t2, k2 = t, k, u, m
-                        if u < t:
-                            t1, k1, t2, k2 = u, m, t, k
-                        at = edge_contact(surface, t1, k1, t2, k2, surface.margin[0], out, at, end)
+        for e in range(first, last):
+            u = entry[e]
+            pairs = crossable(surface.sharp[t], surface.sharp[u])
+            while pairs != 0:  # from bit to bit, since nobody can predict which are set
+                place = ti.math.popcnt((pairs & -pairs) - 1)
+                k, m = place // 3, place % 3
+                pairs &= pairs - 1
+                times = possible_crossings(surface, t, k, u, m, surface.margin[0])
+                if times != 0:
+                    t1, k1, t2, k2 = t, k, u, m
+                    if u < t:
+                        t1, k1, t2, k2 = u, m, t, k
+                    at = edge_contact(surface, t1, k1, t2, k2, times, surface.margin[0], out, at, end)
         return at
 
 

@@ -19,7 +19,7 @@ from taisoft.backend.runtime import kernel
 from taisoft.collision.candidates import NEEDED, sum_parts, visit_near
 from taisoft.collision.contacts import EDGE_EDGE, MORTAR, VERTEX_FACE, write_contact
 from taisoft.collision.features import choose, unit
-from taisoft.collision.overlay import face_vertex, n_face, on_face, shape
+from taisoft.collision.overlay import face_vertex, n_face, on_face, shapes
 from taisoft.collision.surface import dvec, ivec
 
 LEAST_COVERED = 0.2  # of the faces around a node: where less is, contacts of several nodes would be nearly the same
@@ -29,21 +29,22 @@ MAX_CLUSTERS = 8  # contacts of one node; what exceeds them is left to the guard
 
 
 @ti.func
-def _add_face(s: ti.template(), overlay: ti.template(), out: ti.template(), t, b, weight, first, n_before, end):
-    """Add a weight at barycentric coordinates b (3,) of the face of triangle t to its vertices among entries `first` to
-    n_before - 1 of the list, or as new ones if they fit before `end`. Return the new end of the entries, which may be more."""
+def _list_face(s: ti.template(), overlay: ti.template(), out: ti.template(), t, places: ti.template(), first, n_before, end):
+    """Find the vertices of the face of triangle t among entries `first` to n_before - 1 of the list, or add them without weight
+    if they fit before `end`. Set their places, -1 for those that do not. Return the new end of the entries, or more."""
     n = n_before
     for node in range(n_face(overlay, t)):
-        vertex, part = face_vertex(s, overlay, t, node), weight * shape(overlay, t, b, node)
+        vertex = face_vertex(s, overlay, t, node)
         k = ti.min(n, end) - 1  # backwards, since neighbours share vertices
         while k >= first and out.vertex[ti.max(k, first)] != vertex:
             k -= 1
-        if k >= first:
-            out.weight[k] = out.weight[k] + part
-        else:
+        if k < first:
+            k = -1
             if n < end:
-                out.vertex[n], out.weight[n] = vertex, part
+                k = n
+                out.vertex[k], out.weight[k] = vertex, 0.0
             n += 1
+        places[node] = k
     return n
 
 
@@ -95,14 +96,15 @@ def _hats(s: ti.template(), overlay: ti.template(), t, b):
 
 
 @ti.func
-def _belongs(seeds: ti.template(), k, n_seeds, other, n):
-    """Whether a point with normal n (3,) on collider `other` belongs to contact k: the first, or a new one, with such a seed."""
+def _cluster(seeds: ti.template(), n_seeds, other, n):
+    """The first contact of a node with such a seed that a point with normal n (3,) on collider `other` belongs to; n_seeds if
+    there is none."""
     first = n_seeds
     for z in range(n_seeds):
         along = n[0] * seeds[z, 0] + n[1] * seeds[z, 1] + n[2] * seeds[z, 2]
         if first == n_seeds and seeds[z, 3] == other and along > ti.cast(SAME_CLUSTER, ti.f64):
             first = z
-    return first == k
+    return first
 
 
 @ti.func
@@ -120,15 +122,17 @@ def _node_contacts(
 ):
     """Write the contacts of slave node i to out[start:end], and their vertices to the list from `begin` to list_end. Return both
     new counts."""
-    at, last, k, n_seeds = start, begin, 0, 0
+    at, last, k, n_seeds, is_complete = start, begin, 0, 0, False
     seeds = ti.Matrix.zero(ti.f64, MAX_CLUSTERS + 1, 4)  # a normal and the master of each contact
+    places = ti.Vector.zero(ti.i32, 6)  # of the face listed last
     own = s.body[s.ring[s.ring_start[i]]]
-    while k == n_seeds and k < MAX_CLUSTERS:
+    while k == n_seeds and k < MAX_CLUSTERS and not is_complete:
+        is_complete = True
         other, opposite, first, n_first, is_near = -1, -1, last, 0, False
         area, total, nearest = ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64)
         normal, apart, carried = dvec(0.0), dvec(0.0), dvec(0.0)
-        for step in range(3):  # sums, then vertices of a and b
-            step_first, is_master = last, (step == 1) == (own > other)
+        for step in range(2):  # sums and vertices of a, then vertices of b
+            step_first, listed = last, -1
             for r in range(s.ring_start[i], ti.select(step == 0 or is_near, s.ring_start[i + 1], 0)):
                 j, face_begin, face_end = _face_at(s, overlay, s.ring[r], i)
                 for t in range(face_begin, face_end):
@@ -136,7 +140,11 @@ def _node_contacts(
                         u, n, hats = points.triangle[e], points.normal[e], points.hat[e]
                         hat = choose(j, hats[0], hats[1], hats[2])
                         w = points.share[e] * points.area[e] * hat
-                        if w > 0.0 and _belongs(seeds, k, n_seeds, s.body[u], n):
+                        cluster = n_seeds
+                        if w > 0.0:
+                            cluster = _cluster(seeds, n_seeds, s.body[u], n)
+                            is_complete = is_complete and (cluster < n_seeds or k == n_seeds)
+                        if w > 0.0 and cluster == k:
                             if k == n_seeds:
                                 other, opposite = s.body[u], s.triangle[u, 0]
                                 seeds[k, 0], seeds[k, 1], seeds[k, 2], seeds[k, 3] = n[0], n[1], n[2], other
@@ -144,17 +152,27 @@ def _node_contacts(
                             if step == 0:
                                 area, nearest = area + points.area[e] * hat, nearest + w * points.nearest[e]
                                 total, normal, apart = total + w, normal + w * n, apart + w * points.apart[e]
-                            elif is_master and s.node[opposite] < 0:
-                                carried += w * on_face(s, overlay, u, points.master[e], move)
-                            elif is_master:
-                                last = _add_face(s, overlay, out, u, points.master[e], w, step_first, last, list_end)
+                            is_master = (step == 0) == (own > other)
+                            if is_master and s.node[opposite] < 0:
+                                carried += w * on_face(s, overlay, u, shapes(overlay, u, points.master[e]), move)
                             else:
-                                last = _add_face(s, overlay, out, t, points.slave[e], w, step_first, last, list_end)
+                                face, b = t, points.slave[e]
+                                if is_master:
+                                    face, b = u, points.master[e]
+                                if face != listed:
+                                    last = _list_face(s, overlay, out, face, places, step_first, last, list_end)
+                                    listed = face
+                                parts = w * shapes(overlay, face, b)
+                                for node in range(n_face(overlay, face)):
+                                    at_node = places[node]
+                                    if at_node >= 0:  # not +=, which would be atomic
+                                        out.weight[at_node] = out.weight[at_node] + parts[node]
             if step == 0:
                 is_near = k < n_seeds and nearest <= ti.cast(FARTHEST, ti.f64) * total * s.margin[0]
-            elif step == 1:
                 n_first = last - first
-        if is_near:
+        if not is_near:
+            last = first
+        else:
             n, point, zero = unit(normal), dvec(0.0), dvec(0.0)
             for e in range(first, ti.min(last, list_end)):
                 out.weight[e] = out.weight[e] / total

@@ -15,7 +15,7 @@ import taichi as ti
 
 from taisoft.backend.arrays import FieldArena
 from taisoft.collision.candidates import Visitor
-from taisoft.collision.features import BY_FACES, choose, corner, unit
+from taisoft.collision.features import BY_FACES, ROUNDING, choose, corner, unit
 from taisoft.collision.surface import dvec
 from taisoft.collision.vertex_face import max_self_depth
 
@@ -131,10 +131,15 @@ def face_vertex(s: ti.template(), overlay: ti.template(), t, k):
 
 
 @ti.func
-def shape(overlay: ti.template(), t, b, k):
-    """Shape function of node k of the face of triangle t at barycentric coordinates b (3,)."""
-    p, q = choose(k % 3, b[0], b[1], b[2]), choose((k + 1) % 3, b[0], b[1], b[2])
-    return ti.select(overlay.quarter[t] < 0, p, ti.select(k < 3, p * (2.0 * p - 1.0), 4.0 * p * q))
+def shapes(overlay: ti.template(), t, b):
+    """Shape functions (6,) of the nodes of the face of triangle t at barycentric coordinates b (3,), 0 where there is none."""
+    result = ti.Vector.zero(ti.f64, 6)
+    for k in ti.static(range(3)):
+        result[k] = b[k]
+    if overlay.quarter[t] >= 0:
+        for k in ti.static(range(3)):
+            result[k], result[k + 3] = b[k] * (2.0 * b[k] - 1.0), 4.0 * b[k] * b[(k + 1) % 3]
+    return result
 
 
 @ti.func
@@ -147,17 +152,17 @@ def _in_face(overlay: ti.template(), t, b):
 
 
 @ti.func
-def on_face(s: ti.template(), overlay: ti.template(), t, b, x: ti.template()):
-    """Value (3,) of a field of vertices at barycentric coordinates b (3,) of the face of triangle t."""
+def on_face(s: ti.template(), overlay: ti.template(), t, weights, x: ti.template()):
+    """Value (3,) of a field of vertices at a point of the face of triangle t with these `shapes`."""
     total = dvec(0.0)
     for k in range(n_face(overlay, t)):
-        total += shape(overlay, t, b, k) * x[face_vertex(s, overlay, t, k)]
+        total += weights[k] * x[face_vertex(s, overlay, t, k)]
     return total
 
 
 @ti.func
 def _apart(s: ti.template(), overlay: ti.template(), t, u, slave, master, x: ti.template()):
-    """Difference (3,) of a field of vertices between points on the faces of triangles t and u."""
+    """Difference (3,) of a field of vertices between points on the faces of triangles t and u with these `shapes`."""
     return on_face(s, overlay, t, slave, x) - on_face(s, overlay, u, master, x)
 
 
@@ -180,6 +185,17 @@ def _barycentric(x, a, b, c):
     whole = (b - a).cross(c - a)
     v, w = (x - a).cross(c - a) / whole, (b - a).cross(x - a) / whole
     return dvec(1.0 - v - w, v, w)
+
+
+@ti.func
+def _is_outside(a0, a1, a2, b0, b1, b2):
+    """Whether all corners of triangle b lie clearly outside one side of the clockwise triangle a, (2,) each."""
+    found = False
+    for side in range(3):
+        p, d = choose(side, a0, a1, a2), choose(side, a1 - a0, a2 - a1, a0 - a2)
+        h = ti.max((b0 - p).cross(d), (b1 - p).cross(d), (b2 - p).cross(d))  # positive inside
+        found = found or h < -ti.cast(ROUNDING, ti.f64) * d.dot(d)
+    return found
 
 
 @ti.func
@@ -228,8 +244,8 @@ def _rest_normal(s: ti.template(), t):
 
 @ti.func
 def _max_depth(s: ti.template(), overlay: ti.template(), t, u, slave, master, width):
-    """How deep [m] points of two faces with an overlay of a width may be; deeper ones are on the far sides of thin bodies, or of
-    tips."""
+    """How deep [m] points of two faces, with these `shapes` and an overlay of a width, may be; deeper ones are on the far sides
+    of thin bodies, or of tips."""
     a, b = s.body[t], s.body[u]
     depth = ti.min(0.5 * ti.min(s.thickness[a], s.thickness[b]), MAX_DEPTH * width)
     if a == b:
@@ -250,7 +266,9 @@ def _integrate(s: ti.template(), overlay: ti.template(), t, u, out: ti.template(
     E = ti.Matrix.rows([e, n.cross(e)])
     a1, a2, b0 = E @ (corner(s, t, 1) - origin), E @ (corner(s, t, 2) - origin), E @ (corner(s, u, 0) - origin)
     a0, b1, b2 = dvec2(0.0), E @ (corner(s, u, 1) - origin), E @ (corner(s, u, 2) - origin)
-    area, middle, covariance = _intersection(a0, a1, a2, b0, b1, b2)
+    area, middle, covariance = ti.cast(0.0, ti.f64), dvec2(0.0), dvec(0.0)
+    if not (_is_outside(a0, a1, a2, b0, b1, b2) or _is_outside(b0, b2, b1, a0, a1, a2)):
+        area, middle, covariance = _intersection(a0, a1, a2, b0, b1, b2)
     if area > ti.cast(TINY, ti.f64) * ti.max(s.area[t], s.area[u]):
         l0 = ti.sqrt(covariance[0])  # of its Cholesky factor
         l1 = covariance[1] / l0
@@ -262,13 +280,14 @@ def _integrate(s: ti.template(), overlay: ti.template(), t, u, out: ti.template(
             x = middle + dvec2(l0 * c, l1 * c + l2 * d)
             on_t, on_u = _barycentric(x, a0, a1, a2), _barycentric(x, b0, b1, b2)
             slave, master = _in_face(overlay, t, on_t), _in_face(overlay, u, on_u)
-            apart, before = _apart(s, overlay, t, u, slave, master, s.x), _flat_apart(s, t, u, on_t, on_u, overlay.start)
-            closing, gap = -_apart(s, overlay, t, u, slave, master, s.move).dot(n), apart.dot(n)
+            of_t, of_u = shapes(overlay, t, slave), shapes(overlay, u, master)
+            apart, before = _apart(s, overlay, t, u, of_t, of_u, s.x), _flat_apart(s, t, u, on_t, on_u, overlay.start)
+            closing, gap = -_apart(s, overlay, t, u, of_t, of_u, s.move).dot(n), apart.dot(n)
             motion = _flat_apart(s, t, u, on_t, on_u, s.x) - before
             behind = overlay.behind[0] + ti.cast(BEHIND, ti.f64) * (motion - motion.dot(n) * n).norm()
             nearest = gap - ti.max(closing, 0.0)
             share = ti.min(2.0 - 2.0 * nearest / s.margin[0], 1.0)
-            if share > 0.0 and before.dot(n) >= -behind and gap > -_max_depth(s, overlay, t, u, slave, master, width):
+            if share > 0.0 and before.dot(n) >= -behind and gap > -_max_depth(s, overlay, t, u, of_t, of_u, width):
                 if at < end:
                     out.triangle[at], out.area[at], out.share[at], out.nearest[at] = u, area / 3.0, share, nearest
                     out.normal[at], out.slave[at], out.master[at], out.apart[at] = n, slave, master, apart

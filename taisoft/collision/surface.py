@@ -20,7 +20,7 @@ from taisoft.collision.colliders import Topology
 
 SERIAL_BELOW = 1500  # triangles below which one thread is faster than starting the others (about 50 us a loop)
 # Of one thread per triangle: in the loops over nearby pairs, and in cheap loops (boxes, tree refit, sharp edges, reduction)
-TRIANGLE_SECONDS, CHEAP_SECONDS = 5e-7, 5e-9
+TRIANGLE_SECONDS, CHEAP_SECONDS = 1e-7, 5e-9
 NOT_FINITE = 0x7FF  # exponent bits of infinite f64 numbers and of those that are no numbers
 CHUNKS = {"cpu": 64, "cuda": 4096}  # chunks of a list that are processed in parallel, each with its own part of a buffer
 NONFINITE, ACTIVE, PAIRS = 0, 1, 2  # indices into Surface.count

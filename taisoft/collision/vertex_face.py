@@ -151,7 +151,8 @@ def vertex_contacts(s: ti.template(), entry: ti.template(), first, last, i, own,
     """Write contacts of vertex i of collider `own` with triangles entry[first:last], all of one collider. Return the new count.
 
     Contacts go to out[start:end]. margin [m]: largest gap at the closest time of the step. Passes share one loop, so that their
-    callees are compiled once: classify the vertex, collect the faces of a common exit direction, write the contacts.
+    callees are compiled once: classify the vertex, and write its contacts as if it were outside; if it is inside, collect the
+    faces of a common exit direction, and write the contacts instead.
     """
     at = start
     p = s.x[i]
@@ -165,7 +166,7 @@ def vertex_contacts(s: ti.template(), entry: ti.template(), first, last, i, own,
     slack, n_best, total, exit_direction, depth = inf, dvec(0.0), dvec(0.0), dvec(0.0), inf
     normals = ti.Matrix.zero(ti.f64, MAX_TIP_FACES, 3)
     count = 0
-    # faces for the later passes; if there are too many, those passes use the whole row
+    # faces that i is behind, for the later passes; if there are too many, those passes use the whole row
     stored = ti.Vector.zero(ti.i32, MAX_STORED)
     n_stored = 0
     phase, q, size = 4, first, last - first
@@ -187,6 +188,8 @@ def vertex_contacts(s: ti.template(), entry: ti.template(), first, last, i, own,
                     # a neighbour may be out on the far side already; a slight penetration never exits through the far side
                     if state == NONE or (state == INSIDE and min_depth_facing < ti.cast(FACING_DEPTH_RATIO, ti.f64) * min_depth):
                         state, min_depth, best = INSIDE, min_depth_facing, best_facing
+                if state != OUTSIDE:
+                    at = start
                 if state == INSIDE:
                     n_best = 1.0 * s.normal[best]
                     slack = ti.cast(1e-6, ti.f64) * min_depth
@@ -194,8 +197,6 @@ def vertex_contacts(s: ti.template(), entry: ti.template(), first, last, i, own,
                         normals[0, c] = n_best[c]
                     total += n_best
                     count = 1
-                elif state == OUTSIDE:
-                    phase = 1
                 else:
                     phase = 3
                 if n_stored <= MAX_STORED:
@@ -206,8 +207,6 @@ def vertex_contacts(s: ti.template(), entry: ti.template(), first, last, i, own,
                     exit_direction, depth = unit(total), inf  # along it the vertex exits through the first face it reaches
             elif phase == 2:
                 size = 1
-                if state == OUTSIDE:
-                    phase = 3
             phase += 1
             q = 0
             if phase == 4 or size == 0:
@@ -230,12 +229,10 @@ def vertex_contacts(s: ti.template(), entry: ti.template(), first, last, i, own,
                     outside = 1
             pierced = relation == BESIDE and distance <= min_distance * one_plus
             accepted = int(relation == INSIDE or pierced or (relation == OUTSIDE and near))
-            if accepted == 1:
+            if accepted == 1 and relation != OUTSIDE:
                 if n_stored < MAX_STORED:
                     stored[n_stored] = u
                 n_stored += 1
-        elif state == OUTSIDE:
-            accepted = int(relation == OUTSIDE and near)
         elif phase < 3 and (relation == INSIDE or (relation == BESIDE and outside == 0 and distance <= min_distance * one_plus)):
             ridge = 0
             if relation == INSIDE:
@@ -266,6 +263,7 @@ def vertex_contacts(s: ti.template(), entry: ti.template(), first, last, i, own,
                 if -h < min_depth_beside:
                     min_depth_beside, best_beside = -h, u
             else:
+                gap = ti.select(relation == OUTSIDE, distance, h)
                 if distance < nearest:
                     nearest, state = distance, relation
                 if relation == INSIDE and -h < min_depth:
@@ -278,10 +276,8 @@ def vertex_contacts(s: ti.template(), entry: ti.template(), first, last, i, own,
         elif phase == 3:
             accepted, gap = 1, -depth
             n = 1.0 * exit_direction
-        elif state == OUTSIDE:
-            gap = distance
-        if phase >= 2 and accepted == 1:
-            if state == INSIDE:
+        if accepted == 1 and (phase >= 2 or (phase == 0 and relation == OUTSIDE)):
+            if phase >= 2:
                 s.inside[i] |= 1 << (other % INSIDE_BITS)
                 s.exit_direction[i] -= gap * n
             feature, vertex, alone = ivec(VERTEX_FACE, i, u), ivec(i, -1, -1), dvec(1.0, 0.0, 0.0)
