@@ -13,6 +13,7 @@ import numpy as np
 import taisoft as ts
 
 solver = {"integrator": "implicit_euler", "dt": 1 / 120, "seconds": 1.6, "fps": 30.0, "precision": "f64"}
+solver |= {"newton_tolerance": 1e-6}
 
 FRICTION = 0.8
 YOUNG = 3e5  # of the fingers [Pa]
