@@ -66,7 +66,7 @@ def solve_contact_problem(
     if auto and remaining and history[-1] > tolerance:
         r, outer = _run("augmented_lagrangian", W, b, mu, r, tolerance, remaining)
         history += outer[1:]
-    residual = augmented_lagrangian.residual_at((W @ r.ravel() + b).reshape(-1, 3), mu, augmented_lagrangian.find_factors(W), r)
+    residual = augmented_lagrangian.find_residual(W, b, mu, r)
     return ContactSolution(r.ravel(), residual, history, len(history) - 1, residual <= tolerance)
 
 

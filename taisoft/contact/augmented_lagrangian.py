@@ -58,6 +58,11 @@ def relative(changed: float, size: float) -> float:
     return changed / size if size > 0.0 else float(changed != 0.0)
 
 
+def find_residual(W, b: np.ndarray, friction: np.ndarray, r: np.ndarray) -> float:
+    """|r - prox(r - f (W r + b))| / |r|, f of `find_factors`."""
+    return residual_at((W @ r.ravel() + b).reshape(-1, 3), friction, find_factors(W), r)
+
+
 def residual_at(u: np.ndarray, friction: np.ndarray, factor: np.ndarray, r: np.ndarray) -> float:
     """|r - prox(r - f u)| / |r| at velocities u (k,3)."""
     return float(relative(np.linalg.norm(natural_map(u, friction, factor, r)), np.linalg.norm(r)))

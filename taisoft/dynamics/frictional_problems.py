@@ -24,8 +24,7 @@ class FrictionalProblems:
         self.tight = False  # whether the last problem was near the floor
         self._was_direct = False  # whether it was solved directly
         self._is_trial = system.n_direct >= self.TRIAL  # whether the stage's first problem is one
-        # laws that hold better than they must let |r| converge in fewer iterations, where they can
-        self._law_aim = min(stage.contact_tolerance, stage.tolerance) if stage.law_aim is None else stage.law_aim
+        self._law_aim = stage.law_aim
         self._r_scale, self._max_r_scale = FIRST_R, MAX_R_FRICTIONLESS
 
     def goal(self, r: float, scale: float, is_balanced: bool) -> Goal:

@@ -30,7 +30,7 @@ class Sleep:
     """asleep: (n_colliders,) bool, of bodies. tolerance: of Newton's method."""
 
     LOOK, LOOKS = 10, 20
-    STILL, MOST = 20.0, 2e-3  # the latter: of a body's size, the largest motion whatever the tolerance
+    STILL, MOST = 50.0, 2e-3  # the latter: of a body's size, the largest motion whatever the tolerance
     DRIFT = 1.5
 
     def __init__(self, simulation: SimulationState, contact: ContactStep | NoContacts, tolerance: float):

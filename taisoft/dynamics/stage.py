@@ -41,7 +41,7 @@ class Stage:
     linearised: bool = False  # elastic forces are linear from the first iterate on
     prescribed_fraction: float = 1.0  # see `begin_stage`
     renews: bool = True  # whether contacts take their geometry at the iterates
-    law_aim: float | None = None  # residual to which the laws are solved where they can be; None: also to `tolerance`
+    law_aim: float = 0.0  # residual to which the laws are solved where they can be
 
 
 class StepContacts(Protocol):

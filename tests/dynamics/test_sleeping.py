@@ -145,10 +145,12 @@ def test_connected_bodies_sleep_and_wake_together_and_constraints_bear_as_before
     hung.fix(lambda X: X[:, 1] > 0.99 * SIDE)
     scene.add_rigid_body(cube(1), name="rigid", position=(0.0, -3 * SIDE, 0.0), density=200.0)
     scene.add_spring(("hung", (0.0, 0.0, 0.0)), ("rigid", (0.0, SIDE, 0.0)), stiffness=500.0, damping=30.0)
-    load = hung.add_force(lambda X: X[:, 1] < 0.01, (0.0, 0.0, 0.0))
-    assert load is not None
+    hung.add_force(lambda X: X[:, 1] < 0.01, (0.0, 0.0, 0.0))
     with simulator(scene) as sim:
-        steps(sim, REST)
+        for _ in range(2000):  # rounding moves a pendulum about, so that it may count as drifting for a while
+            if sim.asleep:
+                break
+            sim.step()
         assert sim.asleep == ["hung", "rigid"]
         assert sim.reactions()[:8, 1].sum() == pytest.approx(1.2 * WEIGHT, rel=1e-6)
         sim.set_force("hung", 0, (0.0, -0.1, 0.0))

@@ -82,8 +82,8 @@ def everything() -> ts.Scene:
 # in the order in which they are written
 EVERY_SETTING = {"dt": np.float64(1 / 120), "integrator": "bdf2", "contact_solver": "auto", "self_collision": np.bool_(True)}
 EVERY_SETTING |= {"precision": "f64", "arch": "cpu", "allow_unstable": False, "draggable": True, "newton_tolerance": 1e-5}
-EVERY_SETTING |= {"linear_tolerance": None, "contact_tolerance": 1e-3, "tolerance": 0.01, "ramp": 0.5, "budget": 0.01}
-EVERY_SETTING |= {"seconds": np.int64(2), "fps": None, "sleep": False}
+EVERY_SETTING |= {"linear_tolerance": None, "contact_tolerance": 1e-3, "tolerance": 0.01, "ramp": 0.5}
+EVERY_SETTING |= {"budget": 0.01, "sleep": False, "seconds": np.int64(2), "fps": None}
 EVERY_SETTING |= {"quantities": {"sag": "displacement.y beam 4 0.5 0.5", 'of "b"': "reaction b"}}
 
 
