@@ -36,7 +36,7 @@ from taisoft.contact.prox import prox, tangent
 
 TURNED, MISSED = 1e-3, 0.02  # [rad]; of the contact offset: smaller changes of a contact do not count
 SHIFTED = 0.05  # of the finer side's edge: a smaller slip does not change where a contact acts on another body
-STILL = 0.05  # of the contact offset: where all contacts have moved less, no geometry changes
+STILL = 0.2  # of the contact offset: where all contacts have moved less, normals turn by less than TURNED on the way over an edge
 TRUSTED_DEPTH, TRUSTED_CLOSING = 0.5, 0.5  # of the margin; of the finer side's edge
 DEEPEST = 0.1  # of the contact offset: gap below which a new deepest point counts
 SAME_NORMAL = 0.9  # cosine between normals of a contact and its heir
