@@ -181,7 +181,7 @@ class ContactStep:
         self._searched = self._measured_end = None
         self.far.forget()
         if with_impulses:
-            self.problem.count[0], self._last_time, self._search_counts = 0, 0.0, (0, 0)
+            self.problem.count[0], self._last_time, self._search_counts, self._renewal.sides = 0, 0.0, (0, 0), None
 
     def snapshot(self) -> dict:
         """Return the last step's contacts and impulses, and the capacities: a step that exceeds them starts without impulses.
@@ -416,8 +416,8 @@ class ContactStep:
         """Return those of some colliders (n,) bool that have contacts in the last search, or with `pressing` impulses in the last
         substep."""
         if pressing:
-            body, r = download([self.problem.body, self.problem.r], self.n_contacts)
-            body = body[r[:, 0] > 0.0]
+            body, r, struck = download([self.problem.body, self.problem.r, self.problem.impact_impulse], self.n_contacts)
+            body = body[(r[:, 0] > 0.0) | struck.any(axis=1)]
         else:
             body = self.detection.buffer.data.body[self.detection.kept.to_numpy(self.detection.counts.contacts)]
         return colliders & np.isin(np.arange(len(colliders)), body)

@@ -1,8 +1,8 @@
 """A scene on the device, and everything that steps it: state, contacts, drag spring and integrator.
 
 Steppers are imported only when needed, since decorating kernels takes time. A stepper has `advance(n, dt) -> StepResult`;
-`forget`, `numbers_changed` and `loads_changed` to follow changes between steps; `held_steps(dt)`, the steps over which a drag
-force is held; `reactions`; `snapshot` and `restore`; `field_bytes` and `release`.
+`forget`, `numbers_changed`, `loads_changed` and `wake` to follow changes between steps; `settle` to end a step; `held_steps(dt)`,
+the steps over which a drag force is held; `reactions`; `snapshot` and `restore`; `field_bytes` and `release`.
 """
 
 import weakref
@@ -138,6 +138,7 @@ class Dynamics:
         self.state.time = base + (self.state.step_count - count) * self.dt
         report = self._report(result)
         problems = [*result.problems, *self._problems(report)]
+        self.stepper.settle(self.dt, report.converged and not problems)
         report.problems = [f"step {self.state.step_count}: {problem}" for problem in problems]
         return report
 

@@ -154,6 +154,9 @@ class ExplicitStepper:
     def wake(self, *names: str) -> None:
         """Do nothing: nothing sleeps in explicit steps."""
 
+    def settle(self, dt: float, is_solved: bool) -> None:
+        """Do nothing either."""
+
     def snapshot(self) -> dict:
         """Return the state of the stepper, including the reactions.
 

@@ -95,6 +95,25 @@ class ImplicitStepper(ImplicitStages):
         self.first.copy_from(self.simulation.now)
         self.solver.budget.begin(None if self.scheme.c == 0.0 else self.simulation.budget)
         dropped: list[StageResult] = []
+        length = self._length.snapshot()
+        kept, held = self._take(dt, dropped)
+        while sleep is not None and sleep.is_pressed():
+            dropped += kept
+            self.simulation.return_to(self.first)
+            self.n_previous = 0
+            self._length.restore(length)
+            self.contact.discard_search(with_impulses=False)
+            kept, held = self._take(dt, dropped)
+        self.last = merge(kept)
+        return self._report(count_all(self.last, dropped), len(kept), held)
+
+    def settle(self, dt: float, is_solved: bool) -> None:
+        """Let what rests fall asleep after a step of dt. is_solved: whether it converged without problems."""
+        if self.sleep is not None:
+            self.sleep.end_step(self.simulation.time, dt, is_solved, self.reactions)
+
+    def _take(self, dt: float, dropped: list[StageResult]) -> tuple[list[StageResult], float]:
+        """Do as `_take_parts`, and again without halving if an error shows that only convergence was missing."""
         for is_last in (False, True):
             try:
                 kept, held = self._take_parts(dt, dropped)
@@ -110,16 +129,7 @@ class ImplicitStepper(ImplicitStages):
                 length.give_up()
         if self._is_over():
             self._length.give_up()
-        if sleep is not None and sleep.is_pressed():
-            self.simulation.return_to(self.first)
-            self.n_previous = 0
-            self.contact.discard_search(with_impulses=self.scheme.before > 0.0)
-            return self.advance(n, dt)
-        self.last = merge(kept)
-        step = self._report(count_all(self.last, dropped), len(kept), held)
-        if sleep is not None:
-            sleep.end_step(time + dt, step.converged and not step.problems, self.reactions)
-        return step
+        return kept, held
 
     def _take_parts(self, dt: float, dropped: list[StageResult]) -> tuple[list[StageResult], float]:
         """Take a step of dt in parts, which are halved while they are rejected, and then in `dropped`. Return the results of the
@@ -156,6 +166,8 @@ class ImplicitStepper(ImplicitStages):
             left -= units
             self.simulation.move_branches(part)
             contact.end_part(now + part, part if left else dt, self.start.x, self.dissipative)
+            if self.sleep is not None:
+                self.sleep.see_part()
             length.keep(units, converged)
             if converged and self.reached == 1.0 - (left + units) / PARTS:
                 self.reached = 1.0 - left / PARTS

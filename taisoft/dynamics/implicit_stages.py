@@ -89,7 +89,7 @@ class History:
 class ImplicitStages:
     """Stages of one scheme for a simulation state and its contacts; `ImplicitStepper` makes steps of them."""
 
-    GIVEN_LAW = 10.0  # times the tolerance of |r|: to what the laws are solved at least, if their tolerance was given
+    LOOSE_LAW = 10.0  # times the tolerance of |r|: to what the laws are solved at least, if their tolerance is above the default
 
     def __init__(self, simulation: SimulationState, settings: Settings, contact: ContactStep | NoContacts):
         self.simulation, self.scheme, self.contact = simulation, SCHEMES[settings.integrator], contact
@@ -106,8 +106,9 @@ class ImplicitStages:
         self.tolerance = settings.newton_tolerance or DEFAULT_TOLERANCE[settings.precision]
         self.contact_tolerance = settings.contact_tolerance or TOLERANCE[settings.precision]
         self.linear_tolerance = settings.linear_tolerance
-        # laws that hold better than they must let |r| converge in fewer iterations; but what was asked for is enough, if near
-        self._law_aim = min(self.contact_tolerance, (self.GIVEN_LAW if settings.contact_tolerance else 1.0) * self.tolerance)
+        # laws that hold better than they must let |r| converge in fewer iterations; but a looser tolerance was asked for
+        is_loose = self.contact_tolerance > TOLERANCE[settings.precision]
+        self._law_aim = min(self.contact_tolerance, (self.LOOSE_LAW if is_loose else 1.0) * self.tolerance)
 
     def forget(self) -> None:
         """Discard the history, after the state was set."""

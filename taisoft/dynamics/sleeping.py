@@ -1,24 +1,28 @@
 """Sleeping bodies: what rests, with all that it touches, is left out of implicit steps in time.
 
 Bodies belong to one *island* if they are connected, or if the last search found contacts between them. An island falls asleep
-once all its bodies are at rest, after steps that have all converged. A body is at rest if for LOOKS looks, LOOK steps apart, no
-node has been farther from where it was at first than STILL times the tolerance of Newton's method, in sizes of the body, since
-iterations within that tolerance may move a body at rest as far; and if it is not farther at the last one than DRIFT times as far
-as in the first half of them, as what drifts or gains speed would be. The island's nodes are then held, its contacts set aside
-with their forces, and contacts are searched only between it and what does not rest. A step in which everything sleeps only counts
-its time.
+once all its bodies have been at rest for SPANS spans of SPAN looks, LOOK steps apart, all of which converged:
+* no node has been farther from where it was at first than STILL times the tolerance of Newton's method, in sizes of the body;
+* momenta have changed from look to look by less than BALANCED times that tolerance of what gravity and loads give: else forces
+  are not in balance, as at the top of a flight or of a vibration;
+* no span has moved it on as the one before did: else it drifts or gains speed. What iterations within their tolerance do to a
+  body at rest has no direction for long.
+The island's nodes are then held, its contacts set aside with their forces, and contacts are searched only between it and what
+does not rest. A step in which everything sleeps only counts its time.
 
 It wakes before a step whose search finds a contact with something awake or with an obstacle that moves; where only the iterations
-of the step found one that presses, that step is taken again. It wakes, too, with a change of a load, a number, the state or dt,
-and when it is dragged. Some bodies never sleep, see `never_resting`.
+of a part of the step found one that presses, or where that part was held back, the step is taken again. It wakes, too, with a
+change of a load, a number, the state or dt, and when it is dragged. Some bodies never sleep, see `never_resting`.
 
-Weak: a creep that decays ends where the motion left is as small, in single precision some 1e-3 of a size.
+Weak: the rest of a creep that decays fast is lost, in single precision some 1e-3 of a size. Steps take elements and nodes that
+sleep along, unless everything does.
 """
 
 from collections.abc import Callable
 
 import numpy as np
 
+from taisoft.backend.arrays import download
 from taisoft.dynamics.contact import ContactStep
 from taisoft.dynamics.no_contacts import NoContacts
 from taisoft.dynamics.simulation_state import SimulationState
@@ -29,17 +33,21 @@ from taisoft.scene.plan import never_resting
 class Sleep:
     """asleep: (n_colliders,) bool, of bodies. tolerance: of Newton's method."""
 
-    LOOK, LOOKS = 10, 20
+    LOOK, SPAN, SPANS = 10, 10, 3
     STILL, MOST = 50.0, 2e-3  # the latter: of a body's size, the largest motion whatever the tolerance
-    DRIFT = 1.5
+    BALANCED, MOST_UNBALANCED = 20.0, 2e-3  # likewise
+    ROUNDING = 1e-12  # of a size: changes of a velocity by less in the time between two looks are none
+    ALIGNED, LASTING = 0.5, 0.5  # cosine between motions of two spans, and ratio of their lengths, from which a body drifts
 
     def __init__(self, simulation: SimulationState, contact: ContactStep | NoContacts, tolerance: float):
         scene, layout = simulation.scene, simulation.layout
-        self._simulation, self._contact, self._first = simulation, contact, layout.node_start[:-1]
-        self._n, index = len(scene.bodies), {c.name: k for k, c in enumerate(scene.colliders)}
+        self._simulation, self._contact, self._first, self._n = simulation, contact, layout.node_start[:-1], len(scene.bodies)
+        index = {c.name: k for k, c in enumerate(scene.colliders)}
         self._body = np.repeat(np.arange(self._n), np.diff(layout.node_start))  # of each node
         sizes = np.maximum.reduceat(layout.rest, self._first) - np.minimum.reduceat(layout.rest, self._first)
-        self._limit = min(self.STILL * tolerance, self.MOST) * sizes.max(axis=1)
+        self._size = sizes.max(axis=1)
+        self._limit = min(self.STILL * tolerance, self.MOST) * self._size
+        self._unbalanced = min(self.BALANCED * tolerance, self.MOST_UNBALANCED)
         self._restless = np.isin([body.name for body in scene.bodies], never_resting(scene))
         self._links = [sorted(index[name] for name in one.owners) for one in scene.connections]
         self.asleep = np.zeros(len(scene.colliders), dtype=bool)
@@ -49,25 +57,23 @@ class Sleep:
 
     def forget(self) -> None:
         """Let all bodies be awake, and have just moved."""
-        self._x: np.ndarray | None = None  # where bodies stay
+        # (n_nodes, 3): x, where bodies stay; v at the last look; span_x, where the span began; motion in the one before
+        self._seen: dict[str, np.ndarray] | None = None
         self._steps, self._n_islands = 0, 0
-        self._looks, self._early = (
-            np.zeros(self._n, dtype=np.int64),
-            np.zeros(self._n),
-        )  # the latter: motion in the first half [m]
-        self._was_moving = np.zeros(len(self.asleep), dtype=bool)  # obstacles, at the last step
+        self._looks = np.zeros(self._n, dtype=np.int64)
+        self._was_moving, self._pressed = np.zeros_like(self.asleep), np.zeros_like(self.asleep)  # the former: obstacles
         self._hold(np.zeros_like(self.asleep))
 
     def snapshot(self) -> dict:
         """Return the state for a checkpoint."""
-        x = np.zeros((0, 3)) if self._x is None else self._x
-        own = {"steps": self._steps, "looks": self._looks, "early": self._early, "x": x, "forces": self._forces}
+        own = {"steps": self._steps, "looks": self._looks, "forces": self._forces, "seen": self._seen or {}}
         return own | {"asleep": self.asleep, "island": self._island, "was_moving": self._was_moving}
 
     def restore(self, kept: dict) -> None:
         """Restore a `snapshot`, after the contacts."""
-        self._steps, self._x = int(kept["steps"]), np.array(kept["x"]) if len(kept["x"]) else None
-        self._looks, self._early, self._forces = (np.array(kept[name]) for name in ("looks", "early", "forces"))
+        self._steps = int(kept["steps"])
+        self._seen = {name: np.array(values) for name, values in kept["seen"].items()} or None
+        self._looks, self._forces = np.array(kept["looks"]), np.array(kept["forces"])
         self._island, self._was_moving = np.array(kept["island"]), np.array(kept["was_moving"])
         self._n_islands = int(self._island.max()) + 1
         self._hold(np.array(kept["asleep"]))
@@ -83,55 +89,82 @@ class Sleep:
             return bool(self.asleep[: self._n].all())
         if (moving != self._was_moving).any():
             self._was_moving = moving
-            self._let_rest()
+            self._tell_contacts()
         while moving.any() or not self.asleep[: self._n].all():
             contact.search(time, dt)
             if not self.wake(contact.touching(self.asleep)):
-                return False
-        return True
+                break
+        return bool(self.asleep[: self._n].all())
+
+    def see_part(self) -> None:
+        """See what presses on sleeping bodies at the end of a part of a step, before the next one."""
+        if not self._contact.idle and self.asleep.any():
+            self._pressed |= self.asleep if self._contact.paths.held_back else self._contact.touching(self.asleep, pressing=True)
 
     def is_pressed(self) -> bool:
         """Wake what has been pressed in the step that was taken; return whether anything has, so that it must be taken again."""
-        return not self._contact.idle and self.asleep.any() and self.wake(self._contact.touching(self.asleep, pressing=True))
+        pressed, self._pressed = self._pressed, np.zeros_like(self.asleep)
+        return self.wake(pressed)
 
-    def end_step(self, time: float, is_solved: bool, reactions: Callable[[], np.ndarray]) -> None:
-        """End a step at a time [s]: let fall asleep what has rested. is_solved: whether it converged without problems.
+    def end_step(self, time: float, dt: float, is_solved: bool, reactions: Callable[[], np.ndarray]) -> None:
+        """End a step of dt at a time [s]: let fall asleep what has rested. is_solved: whether it converged without problems.
 
         reactions: of `ImplicitStages`.
         """
         self._steps += 1
         if not is_solved:
-            self._x = None
+            self._seen = None
         if self._steps % self.LOOK:
             return
-        x = self._simulation.model.state.x.to_numpy().astype(np.float64)
-        if self._x is None:
-            self._x, self._looks[:] = x.copy(), 0
+        x, v = (values.astype(np.float64) for values in self._simulation.state())
+        if self._seen is None:
+            self._seen = {"x": x, "v": v, "span_x": x.copy(), "motion": np.zeros_like(x)}
+            self._looks[:] = 0
             return
-        moved = np.sqrt(np.maximum.reduceat(((x - self._x) ** 2).sum(axis=1), self._first))
-        is_still = (moved <= self._limit) & ~self._restless
-        self._stay_at(x, ~is_still)
-        self._looks += is_still
-        self._early = np.where(2 * self._looks <= self.LOOKS, np.maximum(self._early * (self._looks > 1), moved), self._early)
-        ready = self._looks >= self.LOOKS
-        self._stay_at(x, drifts := ready & (moved > self.DRIFT * self._early))
-        ready &= ~drifts
+        moves = np.sqrt(self._sums((x - self._seen["x"]) ** 2, np.maximum)) > self._limit
+        moves |= self._restless | self._is_unbalanced(v - self._seen["v"], self.LOOK * dt) | self._drifts(x)
+        self._seen["v"] = v
+        self._looks += 1
+        self._stay_at(x, moves)
+        ready = self._looks >= self.SPANS * self.SPAN
         if (ready & ~self.asleep[: self._n]).any():
             self._fall_asleep(time, ready, reactions)
+
+    def _sums(self, values: np.ndarray, add: np.ufunc = np.add) -> np.ndarray:
+        """Sums (n,) over the nodes of each body of the sums of rows (n_nodes, 3), or their maxima."""
+        return add.reduceat(values.sum(axis=1), self._first)
+
+    def _drifts(self, x: np.ndarray) -> np.ndarray:
+        """Which bodies (n,) bool have moved on, in a span that ends at x (n_nodes, 3), as in the one before."""
+        ends, motion, before = (self._looks + 1) % self.SPAN == 0, x - self._seen["span_x"], self._seen["motion"].copy()
+        nodes = ends[self._body]
+        self._seen["motion"][nodes], self._seen["span_x"][nodes] = motion[nodes], x[nodes]
+        last, first, both = self._sums(motion**2), self._sums(before**2), self._sums(motion * before)
+        lasts = (both > self.ALIGNED * np.sqrt(last * first)) & (last > self.LASTING**2 * first)
+        return ends & (self._looks >= self.SPAN) & lasts
+
+    def _is_unbalanced(self, change: np.ndarray, time: float) -> np.ndarray:
+        """Which bodies (n,) bool are not in balance, by changes of velocities (n_nodes, 3) in a time [s]."""
+        m, gravity = self._simulation.model, np.array(self._simulation.scene.gravity)
+        mass, weight = (values.astype(np.float64)[:, None] for values in download([m.mass, m.gravity_mass]))
+        forces = weight * gravity + (m.loads.to_numpy() if m.loaded else 0.0)
+        inertia = self._sums((mass * change / time) ** 2)
+        is_rounding = self._sums(change**2, np.maximum) <= (self.ROUNDING * self._size / time) ** 2
+        return ~is_rounding & (inertia > self._unbalanced**2 * self._sums(forces**2))
 
     def _stay_at(self, x: np.ndarray, bodies: np.ndarray) -> None:
         """Let bodies (n,) bool have moved to positions (n_nodes, 3) just now."""
         self._looks[bodies] = 0
-        if self._x is not None:
+        if self._seen is not None:
             nodes = bodies[self._body]
-            self._x[nodes] = x[nodes]
+            self._seen["x"][nodes] = self._seen["span_x"][nodes] = x[nodes]
 
     def _moving(self, time: float) -> np.ndarray:
         """Which colliders (n,) bool are obstacles that do not rest from a time on [s]."""
         obstacles = self._simulation.scene.obstacles
         return np.array([False] * self._n + [not obstacle.rests(time) for obstacle in obstacles])
 
-    def _let_rest(self) -> None:
+    def _tell_contacts(self) -> None:
         """Search contacts only with what does not rest."""
         rests = self.asleep.copy()
         rests[self._n :] = rests.any() & ~self._was_moving[self._n :]
@@ -194,7 +227,7 @@ class Sleep:
         self._simulation.asleep = asleep[: self._n][self._body]
         self._simulation.upload_constraints()
         if not self._contact.idle and (asleep.any() or are_new):
-            self._let_rest()
+            self._tell_contacts()
 
     def reactions(self, found: np.ndarray) -> np.ndarray:
         """Return the forces (n_nodes, 3) [N] of constraints, from those of the last step, where sleeping bodies have none."""

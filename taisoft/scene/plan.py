@@ -157,7 +157,13 @@ def make_plan(
         "explicit steps need forces only, and every law defines them for inverted tets too",
     )
     restless = never_resting(scene)
-    why_not = "not requested" if not sleep else "explicit steps move everything" if explicit else "every body is driven"
+    why_not = (
+        "switched off, or steps follow a tolerance"
+        if not sleep
+        else "explicit steps move everything"
+        if explicit
+        else "every body is driven"
+    )
     plan.add(
         "sleeping",
         sleep and not explicit and len(restless) < len(scene.bodies),
