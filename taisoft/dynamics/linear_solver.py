@@ -96,6 +96,7 @@ class LinearSolver:
     def release(self) -> None:
         """Discard the hierarchy; the next solve by multigrid builds a new one."""
         self._hierarchy: Factor | CoarseCorrection | None = None
+        self._factor: Factor | None = None  # the last one
         self._built: tuple | None = None  # (c, beta, x, free) of the last build
 
     def snapshot(self) -> dict:
@@ -218,6 +219,7 @@ class LinearSolver:
         m.state.x.from_numpy(x)
         self._form(True, c, beta)
         try:
-            self._hierarchy, self._built = build_hierarchy(m, A, x, free), (c, beta, x, free)
+            self._hierarchy, self._built = build_hierarchy(m, A, x, free, self._factor), (c, beta, x, free)
+            self._factor = self._hierarchy if isinstance(self._hierarchy, Factor) else None  # whose pattern stays
         finally:
             upload(present)

@@ -21,6 +21,7 @@ from taisoft.linear.multifrontal import Multifrontal
 from taisoft.linear.pcg_work import LinearResult, PcgWork, sum_products
 from taisoft.ranges import owners
 
+FEW_CALLS = 5e-6  # [s] of a front, as in `Multifrontal`, where each factorisation is followed by many solves
 SHIFT = 1e-12  # of its diagonal, added to a matrix: rounding must not make it indefinite
 
 
@@ -75,9 +76,9 @@ class Factor:
         return pcg.solve(model, A, self, work, tolerance, max_iterations)
 
 
-def build_factor(start: np.ndarray, column: np.ndarray, d: int) -> Factor:
+def build_factor(start: np.ndarray, column: np.ndarray, d: int, calls: float = Multifrontal.CALLS) -> Factor:
     """Allocate the factor of matrices with these blocks (d, d), see `Multifrontal`."""
-    fronts, arena = Multifrontal(start, column, d), FieldArena()
+    fronts, arena = Multifrontal(start, column, d, calls), FieldArena()
     n, names = len(fronts.order), ("first", "start", "row", "at", "order")
     indices = {name: arena.filled(name, ti.i32, getattr(fronts, name)) for name in names}
     sizes = {"value": len(fronts.values), "rhs": n, "below": fronts.n_below.max()}
@@ -86,11 +87,14 @@ def build_factor(start: np.ndarray, column: np.ndarray, d: int) -> Factor:
     return Factor(fronts, n, len(fronts.width), **indices, **numbers)
 
 
-def factorised(A: sp.bsr_matrix) -> Factor:
-    """Factorise A; raise numpy.linalg.LinAlgError if it is not positive definite."""
+def factorised(A: sp.bsr_matrix, known: Factor | None = None) -> Factor:
+    """Factorise A for many solves; raise numpy.linalg.LinAlgError if it is not positive definite.
+
+    known: of the same pattern, to be overwritten.
+    """
     d, blocks = A.blocksize[0], A.data.copy()
     blocks[A.indices == owners(np.diff(A.indptr))] *= 1.0 + SHIFT * np.eye(d)
-    found = build_factor(A.indptr, A.indices, d)
+    found = known or build_factor(A.indptr, A.indices, d, FEW_CALLS)
     with one_thread():
         found.fronts.factorise(blocks.reshape(-1)[found.fronts.lower])
     return found

@@ -26,8 +26,10 @@ def has_narrow_band(model: Model, A: BlockCsr) -> bool:
     return is_narrow(*rows_with_diagonals(model, A), 3)
 
 
-def build_hierarchy(model: Model, A: BlockCsr, x: np.ndarray, free: np.ndarray) -> Factor | CoarseCorrection:
-    """Build the preconditioner of A on the free axes (n_nodes, 3) bool. x: (n_nodes, 3) positions [m].
+def build_hierarchy(
+    model: Model, A: BlockCsr, x: np.ndarray, free: np.ndarray, known: Factor | None = None
+) -> Factor | CoarseCorrection:
+    """Build the preconditioner of A on the free axes (n_nodes, 3) bool. x: (n_nodes, 3) positions [m]; known: an earlier one.
 
     Raises numpy.linalg.LinAlgError if A is not positive definite, as far as the factorisations show.
     """
@@ -38,4 +40,4 @@ def build_hierarchy(model: Model, A: BlockCsr, x: np.ndarray, free: np.ndarray) 
     row = block_rows(matrix)
     matrix.data *= free[row][:, :, None] & free[matrix.indices][:, None, :]
     matrix.data[matrix.indices == row] += np.eye(3) * ~free[:, :, None]
-    return factorised(matrix)
+    return factorised(matrix, known)

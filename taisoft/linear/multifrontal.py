@@ -8,6 +8,8 @@ Source: Duff and Reid, "The Multifrontal Solution of Indefinite Sparse Symmetric
 Multifrontal Method for Sparse Matrix Solution", SIAM Review 34, 1992.
 """
 
+from collections.abc import Callable
+
 import numpy as np
 import scipy.linalg as sl
 import scipy.sparse as sp
@@ -27,10 +29,11 @@ class Multifrontal:
     # [s]: a front's calls, a multiplication and addition, and adding one number to the parent's, measured on one core
     CALLS, FLOP, ADDITION = 2e-5, 1e-10, 4e-9
 
-    def __init__(self, start: np.ndarray, column: np.ndarray, d: int = 3):
-        """start (n + 1), column: blocks (d, d) of each row, symmetric, with all diagonal ones."""
-        n, axis = len(start) - 1, np.arange(d)
-        columns, rows, parents = _merge(*_eliminate(start, column, _minimum_degree(start, column)), d)
+    def __init__(self, start: np.ndarray, column: np.ndarray, d: int = 3, calls: float = CALLS):
+        """start (n + 1), column: blocks (d, d) of each row, symmetric, with all diagonal ones. calls [s]: the fewer, the less L
+        stores."""
+        n, axis, self._calls = len(start) - 1, np.arange(d), calls
+        columns, rows, parents = _merge(*_eliminate(start, column, _minimum_degree(start, column)), d, self._cost)
         self.order = (d * np.concatenate(columns)[:, None] + axis).reshape(-1)  # old index of each unknown
         self.place = np.empty(d * n, dtype=np.int64)
         self.place[self.order] = np.arange(d * n)
@@ -56,10 +59,9 @@ class Multifrontal:
         self.seconds = sum(map(self._cost, self.width.tolist(), self.n_below.tolist()))  # expected, of a factorisation
         self.n_entries = int((self.width * (self.width + self.n_below)).sum())  # of L
 
-    @classmethod
-    def _cost(cls, width: int, below: int) -> float:
+    def _cost(self, width: int, below: int) -> float:
         size = width + below
-        return cls.CALLS + cls.FLOP * (size**3 - below**3) / 3 + cls.ADDITION * below**2 / 2
+        return self._calls + self.FLOP * (size**3 - below**3) / 3 + self.ADDITION * below**2 / 2
 
     def unknowns_of(self, part: tuple[int, int]) -> slice:
         """Unknowns of a part, in the order of elimination."""
@@ -131,10 +133,12 @@ def _eliminate(start: np.ndarray, column: np.ndarray, order: np.ndarray) -> tupl
     return [[i] for i in order.tolist()], [{int(order[j]) for j in own} for own in below], parents
 
 
-def _merge(columns: list, rows: list, parents: np.ndarray, d: int) -> tuple[list, list, np.ndarray]:
+def _merge(
+    columns: list, rows: list, parents: np.ndarray, d: int, cost: Callable[[int, int], float]
+) -> tuple[list, list, np.ndarray]:
     """Merge fronts with their parents where that is faster; return those left, children before parents, part by part."""
     n, children = len(columns), [[] for _ in columns]
-    cost, into = Multifrontal._cost, np.arange(len(columns))
+    into = np.arange(len(columns))
     for k in range(n):
         mine = []
         for child in children[k]:
