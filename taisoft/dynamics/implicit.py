@@ -95,15 +95,24 @@ class ImplicitStepper(ImplicitStages):
         self.first.copy_from(self.simulation.now)
         self.solver.budget.begin(None if self.scheme.c == 0.0 else self.simulation.budget)
         dropped: list[StageResult] = []
-        length = self._length.snapshot()
-        kept, held = self._take(dt, dropped)
-        while sleep is not None and sleep.is_pressed():
+        length, is_again = self._length.snapshot(), False
+        while True:
+            try:
+                kept, held = self._take_parts(dt, dropped)
+            except BaseException as error:  # Ctrl-C, too
+                if not self._abandon(error, dropped) or is_again:
+                    raise
+                is_again = True
+                continue
+            if self._is_over():
+                self._length.give_up()
+            if sleep is None or not sleep.is_pressed():
+                break
             dropped += kept
             self.simulation.return_to(self.first)
             self.n_previous = 0
             self._length.restore(length)
             self.contact.discard_search(with_impulses=False)
-            kept, held = self._take(dt, dropped)
         self.last = merge(kept)
         return self._report(count_all(self.last, dropped), len(kept), held)
 
@@ -112,24 +121,16 @@ class ImplicitStepper(ImplicitStages):
         if self.sleep is not None:
             self.sleep.end_step(self.simulation.time, dt, is_solved, self.reactions)
 
-    def _take(self, dt: float, dropped: list[StageResult]) -> tuple[list[StageResult], float]:
-        """Do as `_take_parts`, and again without halving if an error shows that only convergence was missing."""
-        for is_last in (False, True):
-            try:
-                kept, held = self._take_parts(dt, dropped)
-                break
-            except BaseException as error:  # Ctrl-C, too
-                self.simulation.return_to(self.first)
-                was_halved = isinstance(error, SimulationError) and any(result.free for result in dropped)
-                length = self._length
-                self.forget()
-                if is_last or not was_halved:
-                    raise
-                self._length = length  # an error where only convergence was missing: the step is taken without halving for that
-                length.give_up()
-        if self._is_over():
-            self._length.give_up()
-        return kept, held
+    def _abandon(self, error: BaseException, dropped: list[StageResult]) -> bool:
+        """Return to the start of the step; return whether only convergence was missing, so that it is to be taken without halving
+        for that."""
+        self.simulation.return_to(self.first)
+        was_halved, length = isinstance(error, SimulationError) and any(result.free for result in dropped), self._length
+        self.forget()
+        if was_halved:
+            self._length = length
+            length.give_up()
+        return was_halved
 
     def _take_parts(self, dt: float, dropped: list[StageResult]) -> tuple[list[StageResult], float]:
         """Take a step of dt in parts, which are halved while they are rejected, and then in `dropped`. Return the results of the

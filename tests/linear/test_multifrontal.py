@@ -84,8 +84,8 @@ class Pattern:
         factor.fronts.factorise(blocks.reshape(-1)[factor.fronts.lower])
 
 
-def factorised(pattern: Pattern, A: np.ndarray) -> Factor:
-    factor = build_factor(pattern.start, pattern.column, 3)
+def factorised(pattern: Pattern, A: np.ndarray, calls: float = Multifrontal.CALLS) -> Factor:
+    factor = build_factor(pattern.start, pattern.column, 3, calls)
     pattern.factorise(factor, A)
     return factor
 
@@ -185,13 +185,10 @@ def test_places_are_those_of_the_fronts(pattern):
     assert np.array_equal(places, expected)
 
 
-def test_merging_fronts_does_not_change_solutions(pattern, monkeypatch):
+def test_merging_fronts_does_not_change_solutions(pattern):
     """Neither none, as where calls cost nothing, nor all of a part."""
     A, b = pattern.matrix(5), rights(pattern, 2)[:, 0]
-    factors = [factorised(pattern, A)]
-    for calls in (0.0, 1e3):
-        monkeypatch.setattr(Multifrontal, "CALLS", calls)
-        factors.append(factorised(pattern, A))
+    factors = [factorised(pattern, A, calls) for calls in (Multifrontal.CALLS, 0.0, 1e3)]
     merged, apart, whole = (len(factor.fronts.width) for factor in factors)
     assert apart >= merged >= whole == len(factors[0].fronts.parts)
     if pattern.size == 3 * 64:
