@@ -79,10 +79,11 @@ def join_sides(*found: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.nd
 
 def join_contacts(first: ContactRows, second: ContactRows) -> ContactRows:
     """Return the contacts of both."""
-    nodes, weights = join_sides(*((one.nodes, one.weights) for one in (first, second)))
-    rest = {name: np.concatenate([values, getattr(second, name)]) for name, values in vars(first).items()
-            if name not in ("nodes", "weights")}  # fmt: skip
-    return ContactRows(nodes=nodes, weights=weights, **rest)
+    nodes, weights = join_sides((first.nodes, first.weights), (second.nodes, second.weights))
+    others = vars(first).keys() - {"nodes", "weights"}
+    return ContactRows(
+        nodes=nodes, weights=weights, **{name: np.concatenate([getattr(one, name) for one in (first, second)]) for name in others}
+    )
 
 
 def slip_velocities(problem: ContactProblem, v: np.ndarray, duration: float) -> np.ndarray:

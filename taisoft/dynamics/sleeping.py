@@ -136,8 +136,10 @@ class Sleep:
 
     def _drifts(self, x: np.ndarray) -> np.ndarray:
         """Which bodies (n,) bool have moved on, in a span that ends at x (n_nodes, 3), as in the one before."""
-        ends, motion, before = (self._looks + 1) % self.SPAN == 0, x - self._seen["span_x"], self._seen["motion"].copy()
-        nodes = ends[self._body]
+        ends = (self._looks + 1) % self.SPAN == 0
+        if not ends.any():
+            return ends
+        nodes, motion, before = ends[self._body], x - self._seen["span_x"], self._seen["motion"].copy()
         self._seen["motion"][nodes], self._seen["span_x"][nodes] = motion[nodes], x[nodes]
         last, first, both = self._sums(motion**2), self._sums(before**2), self._sums(motion * before)
         lasts = (both > self.ALIGNED * np.sqrt(last * first)) & (last > self.LASTING**2 * first)

@@ -62,7 +62,7 @@ def _shorten(names: list[str]) -> str:
 
 def never_resting(scene: Scene) -> list[str]:
     """Names of the bodies that never sleep: those with prescribed motion, loads along paths, Maxwell branches, volumes or lengths
-    that are kept, or connections to such bodies, or to obstacles that move."""
+    that are kept, or connections to obstacles that move. What touches or is connected to them is in their island."""
     restless = set()
     for body in scene.bodies:
         kept = any(cavity.given == "volume" for cavity in body.cavities)
