@@ -14,7 +14,7 @@ from typing import ClassVar, dataclass_transform
 import numpy as np
 
 from taisoft.display import short_repr
-from taisoft.errors import MeshError, SceneError, SimulationError
+from taisoft.errors import MeshError, SceneError, SimulationError, value_text
 
 _NOTHING = object()
 
@@ -43,7 +43,7 @@ class Guarded:
     _instead_frozen: ClassVar[dict[str, str]] = {}
     _default_frozen: ClassVar[str] = ""  # for names that _instead_frozen leaves out
     _read_only: ClassVar[frozenset[str]] = frozenset()  # attributes that only the class itself sets
-    _contents: ClassVar[dict[str, str]] = {}  # lists and dicts that users must not fill directly -> the call that fills them
+    _contents: ClassVar[dict[str, str]] = {}  # tuples and dicts that only calls fill -> the call
     _sealed = False
     _frozen = False
 
@@ -58,20 +58,28 @@ class Guarded:
             self.__dict__["_sealed"] = True
 
     def _guard_contents(self) -> None:
-        for name, instead in self._contents.items():
-            value = self.__dict__[name]
-            guarded = self.__dict__[name] = FrozenDict(value) if isinstance(value, dict) else GuardedList(value)
-            guarded._refusal = self._error(f"{self._label()}: {name} cannot be changed by hand: {instead}")
+        for name in self._contents:
+            self._hold(name, self.__dict__[name])
+
+    def _held(self, name: str, items) -> "Contents | FrozenDict":
+        """Return a copy of items that refuses changes by hand. name: the attribute that has them."""
+        held = FrozenDict(items) if isinstance(items, dict) else Contents(items)
+        by_hand = f"{self._label()}: {name} cannot be changed by hand: {self._rule(name)}"
+        held._refusal = self._frozen_error(name) if self._frozen else self._error(by_hand)
+        return held
+
+    def _hold(self, name: str, items) -> None:
+        """Store items as contents of the object, also of a frozen one."""
+        self.__dict__[name] = self._held(name, items)
 
     def _freeze(self) -> None:
         """Refuse all changes from now on, also in lists, dicts and arrays."""
+        self.__dict__["_frozen"] = True
         for name, value in self.__dict__.items():
-            if isinstance(value, (list, dict)):
-                guarded = self.__dict__[name] = FrozenDict(value) if isinstance(value, dict) else FrozenList(value)
-                guarded._refusal = self._frozen_error(name)
+            if isinstance(value, (list, Contents, dict)):
+                self._hold(name, value)
             elif isinstance(value, np.ndarray):
                 value.setflags(write=False)
-        self.__dict__["_frozen"] = True
 
     def _check_open(self, call: str) -> str:
         """Return the start of messages of a call that changes the object. Raises the error of the call if it is frozen."""
@@ -79,10 +87,26 @@ class Guarded:
             raise self._frozen_error(call)
         return f"{self._label()}: {call}"
 
-    def _add(self, items: list, one):
-        """Append one to a guarded list of the object, and return it."""
-        list.append(items, one)
+    def _add(self, name: str, one):
+        """Append one to the object's contents of that name, and return it."""
+        self._hold(name, (*self.__dict__[name], one))
         return one
+
+    def _replace(self, name: str, index: int, one) -> None:
+        """Replace one of the object's contents of that name, also during a run."""
+        items = list(self.__dict__[name])
+        items[index] = one
+        self._hold(name, items)
+
+    def _remove(self, *gone) -> None:
+        """Remove some of the object's contents. Raises the object's error if it is frozen or one is none of them."""
+        self._check_open("remove")
+        contents = {name: self.__dict__[name] for name in self._contents if isinstance(self.__dict__[name], tuple)}
+        for one in gone:
+            if not any(one is item for items in contents.values() for item in items):
+                raise self._error(f"{self._label()}: remove: {value_text(one)} is none of its {', '.join(contents)}")
+        for name, items in contents.items():
+            self._hold(name, [item for item in items if not any(item is one for one in gone)])
 
     def _frozen_error(self, name: str) -> Exception:
         call = callable(_declared(type(self), name))
@@ -140,9 +164,6 @@ def thawed(*items: Guarded) -> Iterator[None]:
     """
     before = [(one, one._sealed, one._frozen) for one in items]
     for one in items:
-        for name, value in one.__dict__.items():
-            if isinstance(value, (GuardedList, FrozenDict)):
-                one.__dict__[name] = _mutable_copy(value)
         one.__dict__.update(_sealed=False, _frozen=False)
     try:
         yield
@@ -212,17 +233,13 @@ def unknown(what: str, name: str, known: set[str], instead: dict[str, str]) -> s
     return f"{what} has no attribute {name!r}; did you mean {near[0]!r}?{hint}"
 
 
-class GuardedList(list):
-    """A list that only its owner adds to; items may be removed. Copies and pickles are plain lists."""
+class Contents(tuple):
+    """Items of an object, which only its own calls add and remove. Copies and pickles are plain tuples."""
 
     _refusal: Exception
 
     def __reduce_ex__(self, _protocol):
-        return list, (list(self),)
-
-
-class FrozenList(GuardedList):
-    """An immutable list of a frozen object."""
+        return tuple, (tuple(self),)
 
 
 class FrozenDict(dict):
@@ -238,18 +255,16 @@ def _refuse(self, *_, **__) -> None:
     raise type(self._refusal)(*self._refusal.args)
 
 
-for _name in ("__setitem__", "__iadd__", "__imul__", "append", "extend", "insert"):
-    setattr(GuardedList, _name, _refuse)
-for _name in ("__delitem__", "clear", "pop", "remove", "reverse", "sort"):
-    setattr(FrozenList, _name, _refuse)
+for _name in ("append", "clear", "extend", "insert", "pop", "remove", "reverse", "sort"):
+    setattr(Contents, _name, _refuse)
+for _name in ("__setitem__", "__delitem__", "__iadd__", "__imul__"):
+    setattr(Contents, _name, _refuse)
 for _name in ("__setitem__", "__delitem__", "__ior__", "clear", "pop", "popitem", "setdefault", "update"):
     setattr(FrozenDict, _name, _refuse)
 
 
 def _mutable_copy(value):
-    """Return a mutable copy of a list, dict or array; anything else unchanged."""
-    if isinstance(value, list):
-        return list(value)
+    """Return a mutable copy of a dict or array; anything else unchanged."""
     if isinstance(value, dict):
         return dict(value)
     return value.copy() if isinstance(value, np.ndarray) else value

@@ -155,21 +155,31 @@ def set_contact(
         dynamics.contact.numbers_changed()
 
 
-def set_force(self: "Simulator", body: str, index: int, value) -> None:
-    """Change a force added by `body.add_force`, from the next step on.
+def set_load(self: "Simulator", body: str, kind: str, index: int, value) -> None:
+    """Change the value of a load added by `body.add_load`, or by the call for its kind, from the next step on.
 
-    index: from 0 in the order added to this body. value: total (3,), or (k,3) with one row per node [N]; it replaces a path.
-    Raises SceneError if there is no such force or the value is invalid.
+    index: from 0 in the order in which loads of this kind were added to the body. value: as given there; it replaces a path.
+    Raises SceneError if there is no such load or the value is invalid.
     """
-    _set_load(self, "force", body, index, value)
+    dynamics, changed = self._open(), self.scene.bodies[body_index(self, body)]
+    change_load(changed, kind, index, value)
+    dynamics.loads_changed(changed.name)
+
+
+def set_force(self: "Simulator", body: str, index: int, value) -> None:
+    """Change a force added by `body.add_force`; index and errors as for `set_load`.
+
+    value: total (3,), or (k,3) with one row per node [N]; it replaces a path.
+    """
+    self.set_load(body, "force", index, value)
 
 
 def set_traction(self: "Simulator", body: str, index: int, value) -> None:
-    """Change a traction added by `body.add_traction`, from the next step on; index and errors as for `set_force`.
+    """Change a traction added by `body.add_traction`; index and errors as for `set_load`.
 
     value: (3,) per reference area [Pa]; it replaces a path.
     """
-    _set_load(self, "traction", body, index, value)
+    self.set_load(body, "traction", index, value)
 
 
 def set_tension(self: "Simulator", name: str, value: float) -> None:
@@ -195,11 +205,11 @@ def _set_tendon(sim: "Simulator", given: str, name: str, value: float) -> None:
 
 
 def set_pressure(self: "Simulator", body: str, index: int, value: float) -> None:
-    """Change a pressure added by `body.add_pressure`, from the next step on; index and errors as for `set_force`.
+    """Change a pressure added by `body.add_pressure`; index and errors as for `set_load`.
 
     value: a number [Pa]; it replaces a path.
     """
-    _set_load(self, "pressure", body, index, value)
+    self.set_load(body, "pressure", index, value)
 
 
 def set_cavity(self: "Simulator", name: str, value: float) -> None:
@@ -208,7 +218,7 @@ def set_cavity(self: "Simulator", name: str, value: float) -> None:
     Raises SceneError if there is no cavity of this name or the value is invalid.
     """
     body, cavity = self.scene.cavity(name)
-    _set_load(self, "cavity", body.name, body.cavities.index(cavity), value)
+    self.set_load(body.name, "cavity", body.cavities.index(cavity), value)
 
 
 def set_activation(self: "Simulator", body: str, value: float, region: int | str | None = None) -> None:
@@ -221,12 +231,6 @@ def set_activation(self: "Simulator", body: str, value: float, region: int | str
     if callable(value):
         raise SceneError(f"{what}: it must be a number: give body.activate a path before the Simulator is made")
     activate_fibres(changed, value, region, what)
-    dynamics.loads_changed(changed.name)
-
-
-def _set_load(sim: "Simulator", kind: str, body: str, index: int, value) -> None:
-    dynamics, changed = sim._open(), sim.scene.bodies[body_index(sim, body)]
-    change_load(changed, kind, index, value)
     dynamics.loads_changed(changed.name)
 
 

@@ -204,6 +204,7 @@ class Simulator(Guarded):
     set_gravity = changes.set_gravity
     set_material = changes.set_material
     set_contact = changes.set_contact
+    set_load = changes.set_load
     set_force = changes.set_force
     set_traction = changes.set_traction
     set_tension = changes.set_tension

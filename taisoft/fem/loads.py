@@ -5,6 +5,7 @@ part; and 1 for a force per node.
 Numbers, such as pressures, which force terms turn into nodal forces at the present x, are the model's `amplitudes`.
 """
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,7 +17,7 @@ from taisoft.fem.model import Setup
 from taisoft.fem.pressure import pressures_of
 from taisoft.fem.spring_table import SpringTable
 from taisoft.scene.connection_records import Tendon
-from taisoft.scene.loads import Activation, NodalForce, ScalarLoad, Traction, value_at
+from taisoft.scene.loads import DEAD, Activation, BodyLoad, ScalarLoad, value_at
 from taisoft.scene.rigid import RigidBody
 from taisoft.scene.scene import Body, Scene
 
@@ -27,7 +28,7 @@ class _Path(NamedTuple):
     """A load that varies: its name in messages, its nodes (k,) of the scene, and their weights (k,)."""
 
     name: str
-    load: Traction | NodalForce
+    load: BodyLoad
     nodes: np.ndarray
     weights: np.ndarray
 
@@ -54,13 +55,14 @@ class SceneLoads:
         starts = np.cumsum([0, *(body.n_nodes for body in scene.bodies)])
         self._constant, self._paths = np.zeros((starts[-1], 3)), []
         for body, start in zip(scene.bodies, starts):
-            for kind, loads in (("traction", body.tractions), ("force", body.forces)):
-                for k, load in enumerate(loads):
-                    nodes, weights = _weights(body, load)
-                    if load.path is None:
-                        self._constant[start + nodes] += _spread(load.value, weights)
-                    else:
-                        self._paths.append(_Path(f"body {body.name!r}: {kind} {k}", load, start + nodes, weights))
+            for kind, k, load in body.numbered_loads:
+                if load.feature != DEAD:
+                    continue
+                nodes, weights = _weights(body, load)
+                if load.path is None:
+                    self._constant[start + nodes] += _spread(load.value, weights)
+                else:
+                    self._paths.append(_Path(f"body {body.name!r}: {kind} {k}", load, start + nodes, weights))
         self.nodes = np.unique(np.concatenate([np.zeros(0, dtype=np.int64), *(path.nodes for path in self._paths)]))
         self._scalars, self._moving = scalar_loads(scene), None if springs is None else springs.moving
         self.multipliers = np.array([n for n, (_, load) in enumerate(self._scalars) if load is FOLLOWS], dtype=np.int64)
@@ -159,14 +161,28 @@ def tendon_slots(scene: Scene) -> dict[str, int]:
     return {tendon.name: first + k for k, tendon in enumerate(scene.tendons)}
 
 
-def _weights(body: Body, load: Traction | NodalForce) -> tuple[np.ndarray, np.ndarray]:
-    """Nodes (k,) of the body on which a load acts, and their weights (k,)."""
-    if isinstance(load, Traction):
-        areas = reference.triangle_areas(body, load.triangles)
-        nodes = np.flatnonzero(areas)
-        return nodes, areas[nodes]
+def _areas(body: Body, load: BodyLoad) -> tuple[np.ndarray, np.ndarray]:
+    areas = reference.triangle_areas(body, load.ids)
+    nodes = np.flatnonzero(areas)
+    return nodes, areas[nodes]
+
+
+def _shares(body: Body, load: BodyLoad) -> tuple[np.ndarray, np.ndarray]:
     parts = np.ones(body.n_nodes) if isinstance(body, RigidBody) else reference.lumped_mass(body)
-    return load.nodes, parts[load.nodes] / parts[load.nodes].sum()
+    return load.ids, parts[load.ids] / parts[load.ids].sum()
+
+
+# by kind of dead load: (body, load) -> the nodes (k,) of the body on which it acts, and their weights (k,)
+WEIGHTS: dict[str, Callable[[Body, BodyLoad], tuple[np.ndarray, np.ndarray]]] = {"traction": _areas, "force": _shares}
+
+
+def _weights(body: Body, load: BodyLoad) -> tuple[np.ndarray, np.ndarray]:
+    """Nodes and weights of a dead load. Raises SimulationError for a kind without a row."""
+    if load.kind not in WEIGHTS:
+        raise SimulationError(
+            f"body {body.name!r}: no forces are known of a {load.kind}: add its row to taisoft.fem.loads.WEIGHTS"
+        )
+    return WEIGHTS[load.kind](body, load)
 
 
 def _spread(value: np.ndarray, weights: np.ndarray) -> np.ndarray:

@@ -14,12 +14,12 @@ from taisoft.mesh.nodes import Nodes, make_nodes
 from taisoft.mesh.tet_mesh import TetMesh
 from taisoft.mesh.thickness import coarse_bending
 from taisoft.scene import checks
-from taisoft.scene.body_loads import activate, add_cavity, add_force, add_pressure, add_traction, enclosed_volume
+from taisoft.scene.body_loads import activate, add_cavity, add_force, add_load, add_pressure, add_traction, enclosed_volume
 from taisoft.scene.collision import CONTACT_MODES
 from taisoft.scene.composition import Composition, compose
 from taisoft.scene.curves import Curve, check_shape, middle_nodes
 from taisoft.scene.key_frames import AT_REST, KeyFrames, NodePath
-from taisoft.scene.loads import LOADS, Activation, Cavity, Load, NodalForce, Pressure, Traction
+from taisoft.scene.loads import LOADS, Activation, BodyLoad
 from taisoft.scene.look import colour_or_none, opacity_of
 from taisoft.scene.material import Material
 from taisoft.scene.skins import Skin, embed
@@ -31,11 +31,11 @@ DILATATIONS = ("auto", "local", "mean")
 QUADRATURE_DEGREES = {1: (1,), 2: (2, 4)}  # by element order: degrees of polynomials integrated exactly, the default first
 # other data depend on these
 _SHAPE = ("name", "mesh", "order", "curve", "quadrature_degree", "dilatation", "given_dilatation", "nodes")
-_DERIVED = ("rest_positions", "n_nodes", "is_curved", "volumes", "areas", "composition", "mass", "loads", "skin", "fibres")
+_DERIVED = ("rest_positions", "n_nodes", "is_curved", "volumes", "areas", "composition", "mass", "skin", "fibres")
 _READ_ONLY = (*_SHAPE, *_DERIVED, "activations")
 USE_A_COPY = "change a copy made by scene.snapshot() and make a new Simulator of it"
-_SET = {kind: f"call sim.set_{kind}(body, index, value) for an existing one; otherwise {USE_A_COPY}" for kind in LOADS}
-_SET["cavity"] = f"call sim.set_cavity(name, value) for an existing one; otherwise {USE_A_COPY}"
+BY_KIND = {"tractions": "traction", "forces": "force", "pressures": "pressure", "cavities": "cavity"}  # attributes -> of LOADS
+_SET = {kind: f"{load.set_by} for an existing one; otherwise {USE_A_COPY}" for kind, load in LOADS.items()}
 
 
 @guarded_record("constraint", "add another one by body.fix or body.move")
@@ -57,6 +57,12 @@ def tet_number(name: str, doc: str) -> property:
     return property(lambda body: body.composition.number(name), assign, doc=doc)
 
 
+def loads_of(name: str) -> property:
+    """Return a property of a body for its loads of a kind. name: in BY_KIND."""
+    doc = f"Its loads of kind {BY_KIND[name]!r}, in the order added."
+    return property(lambda body: body._held(name, [one for one in body.loads if one.kind == BY_KIND[name]]), doc=doc)
+
+
 class Body(Guarded):
     """One elastic body of a scene; made by `Scene.add_body`.
 
@@ -71,8 +77,8 @@ class Body(Guarded):
     those of tets only. skin: `Skin` or None, see `embed`. fibres: (m,3) unit vectors at rest, read-only, or None; activations:
     of the fibres, an `Activation` for each region of the mesh, or one.
     colour: sRGB (3,) of its surface or skin in pictures, None for one of the palette; opacity: 1 hides what is behind.
-    constraints, tractions, forces, pressures, cavities: lists of `Constraint`, `Traction`, `NodalForce`, `Pressure`, `Cavity`;
-    items can be removed, but only methods add them.
+    constraints: of `Constraint`; loads: of `BodyLoad`, by kind: tractions, forces, pressures, cavities, which are attributes of
+    their own, too. These are tuples: methods add to them, and `remove` removes.
     collision: one of CONTACT_MODES. Only material, its numbers, position, velocity, collision, colour and opacity can be
     assigned; each is validated. `warn_locking` and `warn_bending` warn if tets of order 1 are far too stiff; `Scene.add_body`
     calls both.
@@ -85,9 +91,14 @@ class Body(Guarded):
         "mass": "set body.density",
         "skin": "call body.embed",
         "activations": "call body.activate",
-        "loads": "call body.add_force, body.add_traction or body.add_pressure",
+        **{loads: f"call body.add_{kind} or body.remove" for loads, kind in BY_KIND.items()},
     }
-    _contents = {"constraints": "call body.fix or body.move", **{loads: f"call body.add_{kind}" for kind, loads in LOADS.items()}}
+    _contents = {
+        "constraints": "call body.fix, body.move or body.remove",
+        "loads": "call body.add_force, body.add_traction, body.add_pressure or body.remove",
+    }
+    _takes: ClassVar = LOADS  # kinds of loads that may act on it
+    _takes_rule: ClassVar[str] = ""  # of others
     extent: ClassVar[str] = "the height of the nearest tet"  # the unit of `distance_outside`
     _default_frozen = USE_A_COPY
     _instead_frozen = {
@@ -96,7 +107,8 @@ class Body(Guarded):
         **dict.fromkeys(("activate", "activations"), "call sim.set_activation(body, value)"),
         "position": "call sim.set_state(positions=..., body=...)",
         "velocity": "call sim.set_state(velocities=..., body=...)",
-        **{name: _SET[kind] for kind, loads in LOADS.items() for name in (f"add_{kind}", loads)},
+        **{f"add_{kind}": rule for kind, rule in _SET.items()},
+        **{loads: _SET[kind] for loads, kind in BY_KIND.items()},
     }
 
     def __init__(
@@ -129,11 +141,8 @@ class Body(Guarded):
         check_shape(what, self.nodes)
         self.position, self.velocity, self.collision = position, velocity, collision
         self.colour, self.opacity = None, 1.0
-        self.constraints: list[Constraint] = []
-        self.tractions: list[Traction] = []
-        self.forces: list[NodalForce] = []
-        self.pressures: list[Pressure] = []
-        self.cavities: list[Cavity] = []
+        self.constraints: tuple[Constraint, ...] = ()
+        self.loads: tuple[BodyLoad, ...] = ()
         self.skin: Skin | None = None
         self.activations = self._inactive()
         self._seal(Body.__init__)
@@ -160,10 +169,13 @@ class Body(Guarded):
         """Stress-free node positions (n,3) [m], read-only; the mesh's vertices come first."""
         return self.nodes.positions
 
+    tractions, forces, pressures, cavities = map(loads_of, BY_KIND)
+
     @property
-    def loads(self) -> list[Load]:
-        """Its tractions, then its forces, its pressures, its cavities and the activations of its fibres."""
-        return [*self.tractions, *self.forces, *self.pressures, *self.cavities, *self.activations]
+    def numbered_loads(self) -> list[tuple[str, int, BodyLoad]]:
+        """Its loads, each with its kind and its number in that kind, as `Simulator.set_load` counts."""
+        first = {kind: k for k, kind in reversed(list(enumerate(one.kind for one in self.loads)))}
+        return [(one.kind, k - first[one.kind], one) for k, one in enumerate(self.loads)]
 
     @property
     def fibres(self) -> np.ndarray | None:
@@ -302,8 +314,20 @@ class Body(Guarded):
         rows = self.selectable
         return rows.start + checks.selection(where, self.rest_positions[rows], what, "node", repeats=repeats)
 
-    add_traction, add_pressure, add_force, add_cavity = add_traction, add_pressure, add_force, add_cavity
+    def select_triangles(self, where, what: str) -> np.ndarray:
+        """Return the chosen rows (k,) of mesh.surface. where: as for `add_traction`; what: start of messages.
+
+        Raises SceneError.
+        """
+        centroids = self.mesh.vertices[self.mesh.surface].mean(axis=1)
+        return checks.selection(where, centroids, what, "surface triangle")
+
+    add_load, add_traction, add_pressure, add_force, add_cavity = add_load, add_traction, add_pressure, add_force, add_cavity
     enclosed_volume, activate, embed = enclosed_volume, activate, embed
+
+    def remove(self, *gone: Constraint | BodyLoad) -> None:
+        """Remove constraints and loads. Raises SceneError for one that the body does not have."""
+        self._remove(*gone)
 
     @property
     def riding_skin(self) -> Skin | None:
@@ -349,4 +373,4 @@ class Body(Guarded):
             if len(axes) and len(nodes):
                 verb = "fixed" if earlier.path is None else "moved"
                 raise SceneError(f"{what}: node {nodes[0]} is already {verb} along {'xyz'[axes[0]]}")
-        return self._add(self.constraints, constraint)
+        return self._add("constraints", constraint)

@@ -7,13 +7,25 @@ import numpy as np
 from taisoft.attributes import thawed
 from taisoft.errors import MeshError, SceneError, reworded
 from taisoft.mesh import quadratic
-from taisoft.mesh.solids import is_closed
 from taisoft.scene import checks
 from taisoft.scene.key_frames import KeyFrames
-from taisoft.scene.loads import Activation, Cavity, NodalForce, Pressure, Traction, either, value_or_path
+from taisoft.scene.loads import LOADS, Activation, BodyLoad, Cavity, NodalForce, Pressure, Traction, value_or_path
 
 if TYPE_CHECKING:
     from taisoft.scene.body import Body
+
+
+def add_load(self: "Body", kind: str, where, *value, **arguments) -> BodyLoad:
+    """Apply a load of a kind that `taisoft.scene.loads` registers, and return it; the calls below do so for those shipped.
+
+    where, value, arguments: as `of` of its class takes them. Raises SceneError.
+    """
+    what = self._check_open(f"add_{checks.choice(kind, f'{self._label()}: add_load: kind', tuple(LOADS))}")
+    if kind not in self._takes:
+        raise SceneError(f"{self._label()}: {self._takes_rule}")
+    order, load = list(LOADS).index, LOADS[kind].of(self, what, where, *value, **arguments)
+    self._hold("loads", sorted((*self.loads, load), key=lambda one: order(one.kind)))
+    return load
 
 
 def add_traction(self: "Body", where, traction) -> Traction:
@@ -23,9 +35,7 @@ def add_traction(self: "Body", where, traction) -> Traction:
     and returns such a mask. traction: (3,) [Pa], or its path: callable t [s] -> (3,), called once here for t = 0, or
     `KeyFrames`, whose translations are the values. Raises SceneError if no triangle is chosen or a number is not finite.
     """
-    what = self._check_open("add_traction")
-    triangles = _triangles(self, where, what)
-    return self._add(self.tractions, Traction(triangles, **value_or_path(traction, what, "traction", Traction.shapes)))
+    return self.add_load("traction", where, traction)
 
 
 def add_pressure(self: "Body", where, pressure) -> Pressure:
@@ -35,22 +45,17 @@ def add_pressure(self: "Body", where, pressure) -> Pressure:
     called once here for t = 0, or `KeyFrames` with values. Pressures on the same triangle add. Raises SceneError if no
     triangle is chosen or a number is not finite.
     """
-    what = self._check_open("add_pressure")
-    triangles = _triangles(self, where, what)
-    given = value_or_path(pressure, what, "pressure", Pressure.shapes)
-    return self._add(self.pressures, Pressure(triangles, closed=is_closed(self.mesh.surface[triangles]), **given))
+    return self.add_load("pressure", where, pressure)
 
 
 def add_force(self: "Body", where, force) -> NodalForce:
     """Apply a dead load to nodes: a total force distributed by lumped mass, or one force per node.
 
-    where: as for `fix`; a node chosen twice counts once. force: (3,) the total, or (k,3) in the order of the chosen
-    nodes [N], or its path, as for `add_traction`. Raises SceneError if no node is chosen or numbers are not finite.
+    where: as for `fix`; a node chosen twice counts once; None, of a rigid body: its centre of mass. On a rigid body's vertices a
+    total force acts in equal parts. force: (3,) the total, or (k,3) in the order of the chosen nodes [N], or its path, as for
+    `add_traction`. Raises SceneError if no node is chosen or numbers are not finite.
     """
-    what = self._check_open("add_force")
-    nodes = self.select_nodes(where, what)
-    given = value_or_path(force, what, "force", ((3,), (len(nodes), 3)))
-    return self._add(self.forces, NodalForce(nodes, where=where if callable(where) else None, **given))
+    return self.add_load("force", where, force)
 
 
 def add_cavity(self: "Body", where, pressure=None, volume=None, name: str | None = None) -> Cavity:
@@ -61,42 +66,18 @@ def add_cavity(self: "Body", where, pressure=None, volume=None, name: str | None
     implicit Euler and BDF2 steps and in statics. name: unique in the scene; by default "NAME cavity 0" and so on, NAME the
     body's. A triangle belongs to one cavity at most. Raises SceneError.
     """
-    what = self._check_open("add_cavity")
-    given, content = either(what, pressure=pressure, volume=volume)
-    own = [cavity.name for cavity in self.cavities]
-    name = checks.free_name(name, f"{self.name} cavity ", own, f"{what}: name")
-    triangles = _triangles(self, where, what)
-    if not is_closed(self.mesh.surface[triangles]):
-        raise SceneError(f"{what}: the chosen triangles have a border: they must enclose the cavity")
-    for other in self.cavities:
-        if len(shared := np.intersect1d(triangles, other.triangles)):
-            raise SceneError(f"{what}: surface triangle {shared[0]} of cavity {name!r} belongs to cavity {other.name!r}")
-    rest_volume = _enclosed(self, triangles)
-    if rest_volume <= 0.0:
-        raise SceneError(f"{what}: the normals of the chosen triangles point outward: they must point into the cavity")
-    cavity = Cavity(name, triangles, given, rest_volume, **value_or_path(content, what, given, Cavity.shapes))
-    check_volume(cavity, f"{what}: volume")
-    return self._add(self.cavities, cavity)
+    return self.add_load("cavity", where, pressure, volume, name)
 
 
 def enclosed_volume(self: "Body", where) -> float:
     """Return the volume [m^3] at rest of the cavity with these surface triangles, chosen as for `add_cavity`."""
-    return _enclosed(self, _triangles(self, where, f"{self._label()}: enclosed_volume"))
-
-
-def _enclosed(body: "Body", triangles: np.ndarray) -> float:
-    x = body.rest_positions[body.face_nodes(triangles)]
+    triangles = self.select_triangles(where, f"{self._label()}: enclosed_volume")
+    x = self.rest_positions[self.face_nodes(triangles)]
     x = x - x[0, 0]
-    if not body.is_curved:
+    if not self.is_curved:
         return -float(np.linalg.det(x[:, :3]).sum()) / 6.0
     points = np.einsum("tax,aq->tqx", x, quadratic.triangle_rule(2)[1])
     return -float((points * quadratic.area_vectors(x)).sum()) / 3.0
-
-
-def _triangles(body: "Body", where, what: str) -> np.ndarray:
-    """Return the chosen rows of mesh.surface, by their centroids at rest."""
-    centroids = body.mesh.vertices[body.mesh.surface].mean(axis=1)
-    return checks.selection(where, centroids, what, "surface triangle")
 
 
 def activate(self: "Body", activation, region: int | str | None = None) -> None:
@@ -124,10 +105,3 @@ def activate_fibres(body: "Body", activation, region: int | str | None, what: st
         body.activations = tuple(
             Activation(**given, region=one.region) if key in (None, one.region) else one for one in body.activations
         )
-
-
-def check_volume(cavity: Cavity, what: str) -> None:
-    """Raise SceneError if a volume is not above 0; of a path, at t = 0."""
-    start = cavity.value if cavity.path is None else cavity.path(0.0)
-    if cavity.given == "volume" and float(start) <= 0.0:
-        raise SceneError(f"{what} must be above 0, not {float(start):g}")

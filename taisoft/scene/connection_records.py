@@ -10,10 +10,10 @@ from typing import ClassVar
 import numpy as np
 
 from taisoft.attributes import guarded_record
-from taisoft.scene.loads import Cavity, ScalarLoad
+from taisoft.scene.loads import ScalarLoad
 
 MAX_OUTSIDE = 0.1  # heights of a tet by which a point may lie outside a body: curved surfaces do not meet exactly
-_ADD_ANOTHER = "remove it from its list and add another one before the Simulator is made"
+_ADD_ANOTHER = "call scene.remove and add another one before the Simulator is made"
 
 
 @guarded_record("point", _ADD_ANOTHER)
@@ -33,6 +33,13 @@ class Spring:
     stiffness: float  #: [N/m]
     rest_length: float | None  #: [m]; None: the distance of the points at the start
     damping: float  #: [N s/m]
+    numbers: ClassVar = ("stiffness", "rest_length", "damping")  #: that may change
+
+    @property
+    def arguments(self) -> dict:
+        """What `add_spring` was given."""
+        own = {"stiffness": self.stiffness, "damping": self.damping, "rest_length": self.rest_length}
+        return dict(zip("ab", self.points)) | own
 
     @property
     def owners(self) -> list[str]:
@@ -53,7 +60,13 @@ class Tendon(ScalarLoad):
     given: str = "force"  #: "force" or "length": what its value is
     stiffness: float | None = None  #: [N/m] of one of given length; None: inextensible
     damping: ClassVar[float] = 0.0  #: [N s/m]
-    owners, kind = Spring.owners, Cavity.kind
+    owners = Spring.owners
+    numbers: ClassVar = ("force", "length", "stiffness")
+
+    @property
+    def arguments(self) -> dict:
+        """What `add_tendon` was given."""
+        return {"points": self.points, self.given: self.given_value, "stiffness": self.stiffness}
 
     def allows(self, value: float) -> bool:
         """Whether a tension [N] or a length [m], whichever is given, may have this value."""
@@ -82,6 +95,13 @@ class Attachment:
     damping: float = 0.0  #: [N s/m] of each node
     where: Callable | None = None  #: as in `Constraint`
     reach: float = MAX_OUTSIDE  #: heights of a tet by which the nodes may lie outside body b
+    numbers: ClassVar = ("stiffness", "damping")
+
+    @property
+    def arguments(self) -> dict:
+        """What `attach` was given, with ids instead of a function."""
+        damping = None if self.stiffness is None else self.damping
+        return {"a": self.a, "where": self.nodes, "b": self.b, "stiffness": self.stiffness, "damping": damping}
 
     @property
     def owners(self) -> list[str]:

@@ -46,7 +46,7 @@ def add_spring(
     if rest_length is not None:
         rest_length = checks.number(rest_length, f"{what}: rest_length", minimum=0.0, unit="m")
     damping = checks.number(damping, f"{what}: damping", minimum=0.0, unit="N s/m")
-    return self._add(self.springs, Spring(name, points, stiffness, rest_length, damping))
+    return self._add("springs", Spring(name, points, stiffness, rest_length, damping))
 
 
 def add_tendon(
@@ -75,7 +75,7 @@ def add_tendon(
         stiffness = checks.number(stiffness, f"{what}: stiffness", above=0.0, unit="N/m")
     tendon = Tendon(name, made, given, stiffness, **value_or_path(content, what, given, Tendon.shapes))
     check_tendon(tendon, tendon.path(0.0) if tendon.value is None else tendon.value, what)
-    return self._add(self.tendons, tendon)
+    return self._add("tendons", tendon)
 
 
 def attach(
@@ -111,7 +111,7 @@ def attach(
     attachment = Attachment(name, body.name, nodes, owner.name, stiffness, damping, where if callable(where) else None)
     if isinstance(owner, Body):
         locate_nodes(self, attachment)
-    return self._add(self.attachments, attachment)
+    return self._add("attachments", attachment)
 
 
 def check_connections(scene: "Scene") -> None:

@@ -8,10 +8,10 @@ from collections.abc import Callable
 import numpy as np
 
 from taisoft.scene.body import Body
-from taisoft.scene.connection_records import Attachment, Connection, Tendon
-from taisoft.scene.key_frames import NodePath, ShapePath
+from taisoft.scene.connection_records import Connection, Point
+from taisoft.scene.key_frames import KeyFrames, NodePath, ShapePath
 from taisoft.scene.laws import LAWS
-from taisoft.scene.loads import LoadPath
+from taisoft.scene.loads import BodyLoad, LoadPath
 from taisoft.scene.numbers import scene_numbers
 from taisoft.scene.rigid import RigidBody
 from taisoft.scene.robot import PlacedRobot
@@ -35,7 +35,7 @@ def scene_fingerprint(scene: Scene, features: dict[str, bool]) -> dict[str, str]
         values = [getattr(shape, field.name) for field in dataclasses.fields(shape)]
         fingerprint[f"{owner}: shape or path"] = digest([type(shape).__name__, *values, *_path_parts(obstacle.given_path)])
     for one in scene.connections:
-        fingerprint[f"{type(one).__name__.lower()} '{one.name}'"] = digest(_connection_parts(one))
+        fingerprint[f"{type(one).__name__.lower()} '{one.name}'"] = digest(_parts(one))
     for placed in scene.robots:
         fingerprint[f"robot '{placed.name}'"] = digest(_robot_parts(placed))
     fingerprint["collision settings"] = digest([json.dumps(dataclasses.asdict(scene.collision)), scene.contact_forces])
@@ -72,21 +72,28 @@ def _body_parts(body: Body) -> dict[str, list]:
         **({} if body.fibres is None else {"fibres": [body.fibres, *(x for a in body.activations for x in _path_parts(a.path))]}),
         "start": [body.position, body.velocity],
         "constraints": [x for c in constraints for x in (c.nodes, c.axes, *_path_parts(c.path))],
-        "loads": [
-            *(x for t in body.tractions for x in ("traction", t.triangles, *_path_parts(t.path))),
-            *(x for f in body.forces for x in ("force", f.nodes, *_path_parts(f.path))),
-            *(x for p in body.pressures for x in ("pressure", p.triangles, *_path_parts(p.path))),
-            *(x for c in body.cavities for x in ("cavity", c.name, c.given, c.triangles, *_path_parts(c.path))),
-        ],
+        "loads": [x for load in body.loads for x in (load.kind, *_parts(load))],
     }
 
 
-def _connection_parts(one: Connection) -> list:
-    """Return the values that define a connection besides its numbers."""
-    if isinstance(one, Attachment):
-        return [one.a, one.nodes, one.b, one.stiffness is None]
-    points = [part for point in one.points for part in (point.owner, point.position)]
-    return [*points, one.given, one.stiffness is None, *_path_parts(one.path)] if isinstance(one, Tendon) else points
+def _parts(one: BodyLoad | Connection) -> list:
+    """Return the arguments that a load or a connection was made with, besides the numbers that may change."""
+    parts = []
+    for name, value in one.arguments.items():
+        is_number = name in one.numbers and isinstance(value, (float, np.ndarray))
+        parts += [name, *(["number"] if is_number else _plain(value))]
+    return parts
+
+
+def _plain(value) -> list:
+    """Return comparable values of an argument: of a function only that it is one."""
+    if isinstance(value, Point):
+        return [value.owner, value.position]
+    if isinstance(value, tuple):
+        return [part for one in value for part in _plain(one)]
+    if isinstance(value, KeyFrames):
+        return [value.times, value.translations, value.rotations, value.pivot, value.smooth, value.release, value.values]
+    return ["function"] if callable(value) else [value]
 
 
 def _robot_parts(placed: PlacedRobot) -> list:
@@ -100,13 +107,10 @@ def _robot_parts(placed: PlacedRobot) -> list:
 
 
 def _path_parts(path: Callable | None) -> list:
-    """Return the comparable values of a path: the data of key frames; of another function only that it exists."""
-    if not isinstance(path, (NodePath, ShapePath, LoadPath)):
-        return [path is None]
-    frames = path.frames
-    values = [frames.times, frames.translations, frames.rotations, frames.pivot, frames.smooth, frames.release, frames.values]
-    start = {NodePath: "starts", ShapePath: "center"}.get(type(path))  # in whose frame key frames are
-    return values + ([getattr(path, start)] if start else [])
+    """Return the comparable values of a path, and of key frames the start in whose frame they are."""
+    start = {NodePath: "starts", ShapePath: "center"}.get(type(path))
+    is_known = start or isinstance(path, LoadPath)
+    return _plain(path.frames if is_known else path) + ([getattr(path, start)] if start else [])
 
 
 def digest(values: list) -> str:

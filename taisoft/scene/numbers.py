@@ -14,7 +14,6 @@ from taisoft.scene import checks
 from taisoft.scene.body import Body
 from taisoft.scene.body_loads import activate_fibres
 from taisoft.scene.laws import LAWS
-from taisoft.scene.loads import LOADS
 from taisoft.scene.material import FIBRE_NUMBERS, MODULI, Material
 from taisoft.scene.plan import change_load, change_tendon
 from taisoft.scene.rigid import RigidBody
@@ -64,11 +63,10 @@ def _entries(scene: Scene) -> Iterator[Entry]:
         own = (_of_rigid if isinstance(body, RigidBody) else _of_material)(body)
         yield from (one for one in own if body.fibres is not None or one[0].rpartition(".")[2] not in FIBRE_NUMBERS)
         yield from () if body.fibres is None else _of_fibres(body)
-        for kind, loads in LOADS.items():
-            for i, load in enumerate(getattr(body, loads)):
-                name = f"{load.name}.{load.given}" if kind == "cavity" else f"{body.name}.{kind}.{i}"
-                value = load.value if load.value is None or load.value.ndim == 2 else load.value.tolist()
-                yield name, value, partial(change_load, body, kind, i)
+        for kind, i, load in body.numbered_loads:
+            named = getattr(load, "name", None)
+            value = load.value if load.value is None or load.value.ndim == 2 else load.value.tolist()
+            yield f"{named}.{load.given}" if named else f"{body.name}.{kind}.{i}", value, partial(change_load, body, kind, i)
     for one in scene.tendons:
         value = None if one.value is None else float(one.value)
         yield f"{one.name}.{one.given}", value, partial(change_tendon, scene, one.given, one.name)
@@ -143,7 +141,7 @@ def _set_in(scene: Scene, kind: str, k: int, name: str, value) -> None:
     items = getattr(scene, kind)
     if name in LIMITS:
         value = checks.number(value, f"{items[k].name!r}: {name}", **LIMITS[name])
-    list.__setitem__(items, k, dataclasses.replace(items[k], **{name: value}))
+    scene._replace(kind, k, dataclasses.replace(items[k], **{name: value}))
 
 
 def _set_pair(scene: Scene, ends: str, name: str, value) -> None:

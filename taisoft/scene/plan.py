@@ -10,11 +10,10 @@ from taisoft.attributes import thawed
 from taisoft.errors import SceneError
 from taisoft.scene import checks
 from taisoft.scene.body import NEARLY_INCOMPRESSIBLE, Body
-from taisoft.scene.body_loads import check_volume
 from taisoft.scene.collision import has_sharp_edges
 from taisoft.scene.connections import check_tendon
 from taisoft.scene.laws import LAWS
-from taisoft.scene.loads import LOADS
+from taisoft.scene.loads import DEAD, FOLLOWER, LOADS
 from taisoft.scene.material import FIBRE_NUMBERS
 from taisoft.scene.obstacles import Box, MeshObstacle
 from taisoft.scene.rigid import RigidBody
@@ -66,7 +65,7 @@ def never_resting(scene: Scene) -> list[str]:
     restless = set()
     for body in scene.bodies:
         kept = any(cavity.given == "volume" for cavity in body.cavities)
-        driven = any(one.path is not None for one in [*scene.constraints(body), *body.loads])
+        driven = any(one.path is not None for one in [*scene.constraints(body), *body.loads, *body.activations])
         if kept or driven or body.composition.branches.shape[1]:
             restless.add(body.name)
     for one in scene.tendons:
@@ -118,11 +117,14 @@ def make_plan(
         f"quadratic tets of {_shorten(quadratic)} in implicit steps",
         "explicit steps need a diagonal mass" if quadratic else "the mass of linear tets is lumped",
     )
-    loaded = [b.name for b in scene.bodies if b.tractions or b.forces]
+    loaded = [b.name for b in scene.bodies if any(load.feature == DEAD for load in b.loads)]
     why = f"tractions or forces on {_shorten(loaded)}" if loaded else "bodies can be dragged"
     plan.add("loads", loaded or draggable, why, "no traction and no force")
-    add_if_any("pressure", lambda b: b.pressures or b.cavities, "on", "no surface is under pressure")
-    varied = [b.name for b in scene.bodies if any(load.path for load in b.loads)] + [t.name for t in scene.tendons if t.path]
+    pressed = [b.name for b in scene.bodies if any(load.feature == FOLLOWER for load in b.loads)]
+    plan.add("pressure", pressed, f"on {_shorten(pressed)}", "no surface is under pressure")
+    varied = [b.name for b in scene.bodies if any(load.path for load in (*b.loads, *b.activations))] + [
+        t.name for t in scene.tendons if t.path
+    ]
     varied += [one.name for one in scene.connections if scene.moves(one) and one.name not in varied]
     plan.add("load_paths", varied, f"on {_shorten(varied)}", "every load is constant")
     fixes, moves = ((lambda b, m=m: any((c.path is not None) == m for c in scene.constraints(b))) for m in (False, True))
@@ -239,19 +241,20 @@ def change_material(body: Body, numbers: dict, on: dict[str, bool], region: int 
 
 
 def change_load(body: Body, kind: str, index: int, value) -> None:
-    """Set the value of a body's load `index`, counted from 0 in the order added; it replaces a path. kind: a key of LOADS.
+    """Set the value of a body's load `index` of a kind in LOADS, counted from 0 in the order added; it replaces a path.
 
     value: (3,) [N], or (k,3) for the k nodes of a force; (3,) [Pa] for a traction; a number [Pa] for a pressure, or as
     given for a cavity. Raises SceneError.
     """
-    loads, what = getattr(body, LOADS[kind]), f"body {body.name!r}: set_{kind}"
-    if not loads:
+    what = f"body {body.name!r}: set_{checks.choice(kind, f'body {body.name!r}: set_load: kind', tuple(LOADS))}"
+    rows = [k for k, one in enumerate(body.loads) if one.kind == kind]
+    if not rows:
         raise SceneError(f"{what}: it has no {kind}: give it one of 0 by body.add_{kind} before the Simulator is made")
-    old = loads[checks.whole(index, f"{what}: index", range(len(loads)))]
+    row = rows[checks.whole(index, f"{what}: index", range(len(rows)))]
+    old = body.loads[row]
     new = replace(old, value=checks.array(value, f"{what}: {kind} {index}", old.shapes), path=None, path_shape=None)
-    if kind == "cavity":
-        check_volume(new, f"{what}: volume")
-    list.__setitem__(loads, index, new)  # past the guard, as `thawed`, but at the rate of a controller
+    new.check_value(what)
+    body._replace("loads", row, new)
 
 
 def change_tendon(scene: Scene, given: str, name: str, value) -> None:
@@ -263,4 +266,4 @@ def change_tendon(scene: Scene, given: str, name: str, value) -> None:
         raise SceneError(f"{calls[given]}: {what} has a given {old.given}: call {calls[old.given]}")
     new = replace(old, value=checks.array(value, f"{what}: {given}", ((),)), path=None, path_shape=None)
     check_tendon(new, new.value, what)
-    list.__setitem__(scene.tendons, index, new)  # as in `change_load`
+    scene._replace("tendons", index, new)

@@ -24,7 +24,7 @@ from taisoft.mesh.topology import EDGES, distinct_edges
 from taisoft.scene.body import Body, Constraint
 from taisoft.scene.connection_records import Attachment
 from taisoft.scene.key_frames import KeyFrames, NodePath
-from taisoft.scene.loads import Load, LoadPath, NodalForce
+from taisoft.scene.loads import BodyLoad
 from taisoft.scene.rigid import RigidBody
 from taisoft.scene.scene import Scene
 
@@ -50,20 +50,20 @@ def _with_bodies(scene: Scene, made: list[tuple[Body, np.ndarray]], finer: float
     """Return the scene with other bodies. made: each with the two old nodes that each of its nodes bisects; finer: old over new
     heights of tets."""
     copied, by_name = scene.snapshot(), {body.name: (body, parents) for body, parents in made}
-    with thawed(copied):
-        copied.bodies = [body for body, _ in made]
-        copied.attachments = []
+    attachments = []
     for one in scene.attachments:
         new, parents = by_name[one.a]
         if isinstance(new, RigidBody):
-            list.append(copied.attachments, replace(one, reach=finer * one.reach))
+            attachments.append(replace(one, reach=finer * one.reach))
             continue
         where = _chosen(scene.body(one.a), one, parents)
         nodes = new.select_nodes(where, f"attachment {one.name!r}")
         share = len(one.nodes) / len(nodes)
         stiffness = None if one.stiffness is None else share * one.stiffness
         changed = {"stiffness": stiffness, "damping": share * one.damping, "reach": finer * one.reach}
-        list.append(copied.attachments, replace(one, nodes=nodes, **changed))
+        attachments.append(replace(one, nodes=nodes, **changed))
+    with thawed(copied):
+        copied.bodies, copied.attachments = [body for body, _ in made], attachments
     return copied
 
 
@@ -79,7 +79,7 @@ def _refined(old: Body) -> tuple[Body, np.ndarray]:
     # Row of the new surface -> triangle of the old one: split.surface lists the four parts of each triangle in sequence.
     rows = {tuple(sorted(t)): k // 4 for k, t in enumerate(split.surface.tolist())}
     parents = np.array([rows[tuple(sorted(t))] for t in mesh.surface.tolist()])
-    _add_surface_loads(new, old, lambda triangles: np.isin(parents, triangles))
+    _add_loads(new, old, parents_of_nodes, lambda triangles: np.isin(parents, triangles))
     return new, parents_of_nodes
 
 
@@ -98,16 +98,22 @@ def _of_order(old: Body, order: int) -> tuple[Body, np.ndarray]:
     if order == 2:
         parents = np.concatenate([parents, distinct_edges(old.mesh.tets)[0]])
     new = _on_mesh(old, old.mesh, order, parents)
-    _add_surface_loads(new, old, lambda triangles: triangles)
+    _add_loads(new, old, parents, lambda triangles: triangles)
     return new, parents
 
 
-def _add_surface_loads(new: Body, old: Body, chosen: Callable[[np.ndarray], np.ndarray]) -> None:
-    """Add the loads on triangles of the old body. chosen: old triangles -> what chooses the new ones."""
-    for load in (*old.tractions, *old.pressures):
-        getattr(new, f"add_{load.kind}")(chosen(load.triangles), _load_of(load))
-    for cavity in old.cavities:
-        new.add_cavity(chosen(cavity.triangles), name=cavity.name, **{cavity.given: _load_of(cavity)})
+def _add_loads(new: Body, old: Body, parents: np.ndarray, chosen: Callable[[np.ndarray], np.ndarray]) -> None:
+    """Add the loads of the old body. parents: see `_on_mesh`; chosen: old triangles -> what chooses the new ones."""
+    for load in old.loads:
+        if load.items == "triangles":
+            where = chosen(load.ids)
+        elif (load.path_shape if load.value is None else load.value.shape) == (len(load.ids), 3):  # by node
+            where = load.ids
+            if where.max() >= new.nodes.n_elastic or not (parents[where] == where[:, None]).all():
+                raise SceneError(f"body {old.name!r}: linear tets have no mid-edge nodes for its forces")
+        else:
+            where = _chosen(old, load, parents)
+        new.add_load(load.kind, **load.arguments | {"where": where})
 
 
 def _own_parents(n: int) -> np.ndarray:
@@ -115,7 +121,7 @@ def _own_parents(n: int) -> np.ndarray:
 
 
 def _on_mesh(old: Body, mesh: TetMesh, order: int, parents: np.ndarray) -> Body:
-    """Return the body on another mesh, without loads on triangles. parents: (n,2), the old nodes that each new one bisects."""
+    """Return the body on another mesh, without loads. parents: (n,2), the old nodes that each new one bisects."""
     velocity = old.velocity if old.velocity.shape == (3,) else old.velocity[parents].mean(axis=1)
     degree = old.quadrature_degree if order == old.order else None
     copies = mesh.n_tets // old.mesh.n_tets
@@ -137,22 +143,10 @@ def _on_mesh(old: Body, mesh: TetMesh, order: int, parents: np.ndarray) -> Body:
             new.fix(where, axes)
         else:
             new.move(where, _path(old, constraint), axes)
-    for force in old.forces:
-        if (3,) == (force.path_shape if force.value is None else force.value.shape):  # a total force
-            new.add_force(_chosen(old, force, parents), _load_of(force))
-            continue
-        if force.nodes.max() >= new.nodes.n_elastic or not (parents[force.nodes] == force.nodes[:, None]).all():
-            raise SceneError(f"body {old.name!r}: linear tets have no mid-edge nodes for its forces")
-        new.add_force(force.nodes, _load_of(force))
     return new
 
 
-def _load_of(load: Load):
-    """Return what the method that added a load was given: a value or a path."""
-    return load.value if load.path is None else load.path.frames if isinstance(load.path, LoadPath) else load.path
-
-
-def _chosen(old: Body, item: Constraint | NodalForce | Attachment, parents: np.ndarray):
+def _chosen(old: Body, item: Constraint | BodyLoad | Attachment, parents: np.ndarray):
     """Return the selection of new nodes: the function that chose the old ones, or ids (k,)."""
     if item.where is not None:
         return item.where

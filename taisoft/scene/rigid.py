@@ -26,7 +26,6 @@ from taisoft.scene.body import Body, Constraint
 from taisoft.scene.composition import Composition, compose
 from taisoft.scene.key_frames import KeyFrames
 from taisoft.scene.laws import LAWS
-from taisoft.scene.loads import NodalForce
 from taisoft.scene.material import Material
 from taisoft.scene.obstacles import checked_pose
 
@@ -50,6 +49,7 @@ class RigidBody(Body):
     """
 
     extent = "its size"
+    _takes, _takes_rule = ("force",), NO_LOADS
     _own = ("centre", "inertia", "shape", "surface", "given_young")
     _read_only = Body._read_only | frozenset(_own)
     _instead = Body._instead | dict.fromkeys((*_own, "material", "young", "density", "start_twist"), ADD_ANOTHER)
@@ -231,13 +231,6 @@ class RigidBody(Body):
             path = PosePath(path, self.mesh.vertices - self.centre, f"{self._label()}: the path")
         return super().move(None, path, axes)
 
-    def add_force(self, where, force) -> NodalForce:
-        """Apply a dead load to vertices: a total force, in equal parts, or one force per vertex.
-
-        where: as for `select_nodes`; None: the centre of mass. force: as for `Body.add_force`.
-        """
-        return super().add_force(where, force)
-
     def _compose(self, composition: Composition) -> None:
         if self._sealed:
             raise SceneError(f"{self._label()}: its numbers follow from add_rigid_body: add another one")
@@ -246,7 +239,7 @@ class RigidBody(Body):
     def _refuse(self, *_, **__) -> None:
         raise SceneError(f"{self._label()}: {NO_LOADS}")
 
-    add_traction = add_pressure = add_cavity = enclosed_volume = embed = _refuse
+    enclosed_volume = embed = _refuse
 
 
 class Pose(NamedTuple):

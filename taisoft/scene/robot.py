@@ -255,5 +255,5 @@ def add_robot(
     if not made:
         raise SceneError(f"{what}: {robot.path} has no shape that collides" + ("" if links is None else " in these links"))
     for obstacle in made:
-        self._add(self.obstacles, obstacle)
-    return self._add(self.robots, placed)
+        self._add("obstacles", obstacle)
+    return self._add("robots", placed)

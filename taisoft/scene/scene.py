@@ -5,7 +5,7 @@ Every input is validated and converted to arrays when it is added, so an existin
 
 import copy
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 
 import numpy as np
@@ -37,19 +37,19 @@ class Scene(Guarded):
     `add_robot`.
 
     contact_pairs: {frozenset of two names, or of one for a body with itself: (friction, restitution)}, each a number, or
-    None for the default of `contact_numbers`; read-only, changed by `set_contact`. Bodies, obstacles and connections can be
-    removed from their lists, but only methods add them.
+    None for the default of `contact_numbers`; read-only, changed by `set_contact`. Bodies, obstacles and connections are tuples:
+    methods add to them, and `remove` removes.
 
     background, lights, camera: how pictures show the scene; see `taisoft.scene.look`.
     A Simulator freezes the scene that it takes, see `freeze`.
     """
 
     _contents = {
-        "bodies": "call scene.add_body",
-        "obstacles": "call scene.add_obstacle",
-        "springs": "call scene.add_spring",
-        "tendons": "call scene.add_tendon",
-        "attachments": "call scene.attach",
+        "bodies": "call scene.add_body or scene.remove",
+        "obstacles": "call scene.add_obstacle or scene.remove",
+        "springs": "call scene.add_spring or scene.remove",
+        "tendons": "call scene.add_tendon or scene.remove",
+        "attachments": "call scene.attach or scene.remove",
         "robots": "call scene.add_robot",
         "contact_pairs": "call scene.set_contact(name_a, name_b, friction=...)",
     }
@@ -67,12 +67,12 @@ class Scene(Guarded):
         x, y, z = np.zeros(3) if gravity is None else checks.vector(gravity, "scene: gravity")
         self.up = up if up is not None else "z" if x == y == 0.0 > z else "y"
         self.gravity = 0.0 - 9.81 * UP[self.up] if gravity is None else gravity
-        self.bodies: list[Body] = []
-        self.obstacles: list[Obstacle] = []
-        self.springs: list[Spring] = []
-        self.tendons: list[Tendon] = []
-        self.attachments: list[Attachment] = []
-        self.robots: list[PlacedRobot] = []
+        self.bodies: tuple[Body, ...] = ()
+        self.obstacles: tuple[Obstacle, ...] = ()
+        self.springs: tuple[Spring, ...] = ()
+        self.tendons: tuple[Tendon, ...] = ()
+        self.attachments: tuple[Attachment, ...] = ()
+        self.robots: tuple[PlacedRobot, ...] = ()
         self.contact_pairs: dict[frozenset[str], tuple[float | None, float | None]] = {}
         self.collision = CollisionSettings()
         self.allow_initial_overlap, self.contact_forces = False, True
@@ -213,7 +213,7 @@ class Scene(Guarded):
     @property
     def loads(self) -> list:
         """The loads of all bodies, then the tendons: what has a value or a path."""
-        return [*(load for body in self.bodies for load in body.loads), *self.tendons]
+        return [*(load for body in self.bodies for load in (*body.loads, *body.activations)), *self.tendons]
 
     add_spring, add_tendon, attach, add_robot = add_spring, add_tendon, attach, add_robot
 
@@ -272,7 +272,7 @@ class Scene(Guarded):
         shape = order, quadrature_degree, collision, dilatation, fibres, curve
         body = Body(name, mesh, material, position, velocity, *shape, **numbers)
         body.colour, body.opacity = colour, opacity
-        self._add(self.bodies, body)
+        self._add("bodies", body)
         body.warn_locking(stacklevel=2)
         body.warn_bending(stacklevel=2)
         return body
@@ -303,7 +303,7 @@ class Scene(Guarded):
         name = self._free_name(name, "rigid")
         body = RigidBody(name, mesh, density, position, velocity, angular_velocity, friction, restitution, young)
         body.colour, body.opacity = colour, opacity
-        return self._add(self.bodies, body)
+        return self._add("bodies", body)
 
     def add_obstacle(
         self,
@@ -323,7 +323,7 @@ class Scene(Guarded):
         """
         self._check_open("add_obstacle")
         name = self._free_name(name, "obstacle")
-        return self._add(self.obstacles, Obstacle(shape, name, friction, restitution, path, colour, opacity))
+        return self._add("obstacles", Obstacle(shape, name, friction, restitution, path, colour, opacity))
 
     def add_ground(
         self,
@@ -337,6 +337,10 @@ class Scene(Guarded):
         """Add a half-space that is level and whose surface has this height [m] along `up`; return it. Raises SceneError."""
         point = checks.number(height, "ground: height", unit="m") * UP[self.up] + 0.0
         return self.add_obstacle(HalfSpace(point, UP[self.up]), name, friction, restitution, None, colour, opacity)
+
+    def remove(self, *gone: Body | Obstacle | Connection) -> None:
+        """Remove bodies, obstacles and connections. Raises SceneError for one that the scene does not have."""
+        self._remove(*gone)
 
     def body(self, name: str) -> Body:
         """Return the body with this name. Raises SceneError if there is none."""
@@ -404,6 +408,6 @@ class Scene(Guarded):
         return checks.free_name(name, kind, [one.name for one in self.colliders])
 
 
-def _find(items: list, name: str, kind: str) -> Body | Obstacle:
+def _find(items: Sequence, name: str, kind: str) -> Body | Obstacle:
     """Return the item with this name. Raises SceneError with the closest name if there is none."""
     return items[checks.index(name, [item.name for item in items], f"scene: no {kind}")]

@@ -52,10 +52,9 @@ from taisoft.scene.material import Material
 from taisoft.scene.obstacles import Box, Capsule, HalfSpace, MeshObstacle, Sphere
 from taisoft.scene.scene import Scene
 from taisoft.scene.tables import Table, arguments_of, check_values, value_text
-from taisoft.scene.toml_connections import CONNECTIONS, add_connections
+from taisoft.scene.toml_calls import CONNECTIONS, OF_RIGID, add_connections, body_calls, call_methods
 from taisoft.scene.toml_look import LOOK_KEYS, read_look
 from taisoft.scene.toml_meshes import kind_of, mesh_of, solid_of, surface_of
-from taisoft.scene.toml_methods import METHODS, OF_RIGID, call_methods
 
 SHAPES = {"half_space": HalfSpace, "sphere": Sphere, "box": Box, "capsule": Capsule, "mesh": MeshObstacle}
 GROUND = "ground"  # a shape as well: a half-space whose normal is up
@@ -116,7 +115,7 @@ def _read(tables: Table, allow_outside: bool) -> tuple[Scene, dict]:
         return meshes[text]
 
     for name in bodies.known:
-        table = bodies.table(name, [*known, *METHODS, "materials", "skin"], ["mesh"])
+        table = bodies.table(name, [*known, *body_calls(), "materials", "skin"], ["mesh"])
         body = _add_body(scene, name, table, materials, shared(table, mesh_of), _curve(table, allow_outside))
         if "skin" in table:
             skin = table.table("skin", ["surface", "contact"], ["surface"])
@@ -128,7 +127,7 @@ def _read(tables: Table, allow_outside: bool) -> tuple[Scene, dict]:
         order = tables.values["body_order"]
         if not isinstance(order, list) or sorted(map(str, order)) != sorted([*bodies.known, *rigid.known]):
             raise tables.error("body_order", "must list each name of bodies and rigid_bodies once")
-        scene.bodies.sort(key=lambda body: order.index(body.name))
+        scene._hold("bodies", sorted(scene.bodies, key=lambda body: order.index(body.name)))
     obstacles = tables.named("obstacles")
     for name in obstacles.known:
         _add_obstacle(scene, name, obstacles)

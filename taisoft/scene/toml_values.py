@@ -1,13 +1,10 @@
-"""Values of a scene file: what is stored of records, loads and paths, and how TOML writes it."""
+"""Values of a scene file: what is stored of records and chosen nodes, and how TOML writes it."""
 
 import dataclasses
-from collections.abc import Callable
 
 import numpy as np
 
-from taisoft.errors import SceneError
 from taisoft.scene.body import Body
-from taisoft.scene.loads import Load, LoadPath
 from taisoft.scene.tables import key_path, key_text, quote
 
 MAX_LINE = 100  # maximum number of characters of numbers in a line
@@ -17,20 +14,6 @@ def fields_of(record) -> dict:
     """Return the fields of a record that are not None."""
     values = {field.name: getattr(record, field.name) for field in dataclasses.fields(record)}
     return {key: value for key, value in values.items() if value is not None}
-
-
-def frames_of(path: Callable, kind: type, what: str) -> dict:
-    """Return the fields of a path's key frames. kind: of such paths. Raises SceneError, which starts with what varies."""
-    if not isinstance(path, kind):
-        raise SceneError(f"{what} along a function, which a file cannot store: use ts.KeyFrames")
-    return fields_of(path.frames)
-
-
-def load_value(load: Load, what: str):
-    """Return a load's value, or the fields of its key frames. what: its owner, in messages."""
-    if load.path is not None:
-        return frames_of(load.path, LoadPath, f"{what}: has a {load.kind}")
-    return load.value if load.value.ndim else float(load.value)
 
 
 def ids_of(ids: np.ndarray, n: int) -> str | np.ndarray:

@@ -22,16 +22,14 @@ from taisoft.scene.checks import SOLVER_CHECKS, check_solver
 from taisoft.scene.fibres import directions
 from taisoft.scene.key_frames import ShapePath
 from taisoft.scene.laws import SHIPPED
-from taisoft.scene.loads import Cavity, NodalForce
 from taisoft.scene.material import MODULI, Material
 from taisoft.scene.obstacles import Obstacle
 from taisoft.scene.rigid import RigidBody
 from taisoft.scene.scene import Scene
 from taisoft.scene.toml import NONE_TEXT, SCENE_KEYS, SHAPES, SURFACE_KEYS
-from taisoft.scene.toml_connections import connection_tables
+from taisoft.scene.toml_calls import calls_of, connection_tables, stored
 from taisoft.scene.toml_look import look_of, look_tables
-from taisoft.scene.toml_methods import constraint_tables
-from taisoft.scene.toml_values import fields_of, frames_of, ids_of, load_value, nodes_of, toml_of
+from taisoft.scene.toml_values import fields_of, toml_of
 
 FOREIGN_PATH = "rotates along a path made for {}, which a file cannot store: pass the ts.KeyFrames themselves"
 
@@ -146,7 +144,7 @@ def _mesh_table(mesh: TetMesh | SurfaceMesh, stem: str, meshes: dict[str, TetMes
 
 
 def _body(body: Body, materials: dict[Material, str], stem: str, meshes: dict[str, TetMesh]) -> dict:
-    composition, what = body.composition, f"body {body.name!r}"
+    composition = body.composition
     names = {body.mesh.region_names.get(key, str(key)): materials[one] for key, one in composition.materials.items()}
     table = {"materials": names} if composition.has_regions else {"material": materials[composition.first]}
     table |= {"mesh": _mesh_table(body.mesh, stem, meshes)}
@@ -167,23 +165,11 @@ def _body(body: Body, materials: dict[Material, str], stem: str, meshes: dict[st
         table["velocity"] = body.velocity[: body.nodes.n_elastic]
     if body.skin is not None:
         table["skin"] = {"surface": _mesh_table(body.skin.surface, stem, meshes), "contact": body.skin.contact}
-    table |= constraint_tables(body, FOREIGN_PATH.format("nodes that start elsewhere"))
-    table |= {key: [] for key in ("traction", "force", "pressure", "cavity")}
     if body.fibres is not None and (
         body.mesh.fibres is None or not np.array_equal(body.fibres, directions("", body.mesh, body.mesh.fibres))
     ):
         table["fibres"] = body.fibres[0] if (body.fibres == body.fibres[0]).all() else body.fibres
-    active = [one for one in body.activations if one.path is not None or one.value != 0.0]
-    regions = [{} if one.region is None else {"region": body.mesh.region_names.get(one.region, one.region)} for one in active]
-    table["activate"] = [named | {"activation": load_value(one, what)} for named, one in zip(regions, active)]
-    for load in body.loads[: len(body.loads) - len(body.activations)]:
-        kind, named = ("cavity", {"name": load.name}) if isinstance(load, Cavity) else (load.kind, {})
-        if isinstance(load, NodalForce):
-            where = nodes_of(body, load.nodes)
-        else:
-            where = {"triangles": ids_of(load.triangles, len(body.mesh.surface))}
-        table[kind].append(named | where | {load.kind: load_value(load, what)})
-    return table
+    return table | calls_of(body, FOREIGN_PATH.format("nodes that start elsewhere"))
 
 
 def _rigid_body(body: RigidBody, stem: str, meshes: dict[str, TetMesh]) -> dict:
@@ -193,9 +179,7 @@ def _rigid_body(body: RigidBody, stem: str, meshes: dict[str, TetMesh]) -> dict:
     table |= {"friction": first.friction, "restitution": first.restitution} | look_of(body)
     if body.given_young is not None:
         table["young"] = body.given_young
-    table |= constraint_tables(body, "its position was set after its path with rotations: move it again")
-    forces = [nodes_of(body, one.nodes) | {"force": load_value(one, body._label())} for one in body.forces]
-    return table | {"force": forces}
+    return table | calls_of(body, "its position was set after its path with rotations: move it again")
 
 
 def _material(material: Material) -> dict:
@@ -213,7 +197,7 @@ def _obstacle(obstacle: Obstacle) -> dict:
     path, what = obstacle.given_path, f"obstacle {obstacle.name!r}"
     if path is None:
         return table
-    frames = frames_of(path, ShapePath, f"{what}: moves")
+    frames = stored(path.frames if isinstance(path, ShapePath) else path, f"{what}: moves")
     own = np.array_equal(path.center, shape.pivot)
     if not own and {"rotations", "pivot"} <= frames.keys():  # otherwise the center does not matter
         raise SceneError(f"{what}: {FOREIGN_PATH.format('a shape with another center')}")

@@ -54,7 +54,7 @@ class DrawnBody:
         skin, surface = body.riding_skin, np.asarray(body.nodes.surface)
         fixed = [c.nodes for c in scene.constraints(body) if c.path is None] if skin is None else []
         fixed = np.intersect1d(np.concatenate(fixed), surface) if fixed else np.empty(0, dtype=np.int64)
-        loaded = [body.mesh.surface[some(t.triangles, MAX_LOAD_ARROWS)] for t in body.tractions]
+        loaded = [body.mesh.surface[some(t.triangles, MAX_LOAD_ARROWS)] for t in body.loads if t.arrows == "tractions"]
         look = body.colour, body.opacity, some(fixed, MAX_MARKERS), loaded
         drawn = cls(body.name, np.asarray(body.position), np.asarray(body.rest_positions), surface, *look)
         if skin is not None:
@@ -122,7 +122,7 @@ class DrawnScene:
         look = scene.background, scene.lights, scene.camera, framed_points(scene)
         marks = np.concatenate([np.zeros(0, dtype=np.int64), *attached]), []
         drawn = cls(scene.up, [DrawnBody.of(scene, body) for body in scene.bodies], list(scene.obstacles), *look, *marks)
-        for body, load, _ in pressing(scene):
+        for body, _, load in with_arrows(scene, "pressures"):
             corners = body.mesh.surface[load.triangles]
             extent = np.sort(np.ptp(body.mesh.vertices[np.unique(corners)], axis=0))[1]
             longest = min(PRESSURE_ARROW * drawn.size, IN_CHANNEL * float(extent))
@@ -200,11 +200,10 @@ class DrawnState:
         return given | {"poses": poses, "segments": None if segments is None else list(segments)}
 
 
-def pressing(scene) -> Iterable[tuple[Any, Any, Any]]:
-    """Return (body, load, key) of all pressures and cavities; key: name of a cavity, else index of the pressure in its body."""
+def with_arrows(scene, layer: str) -> Iterable[tuple[Any, int, Any]]:
+    """Return (body, index, load) of all loads that a layer shows; index: among those of its kind in its body."""
     for body in scene.bodies:
-        yield from ((body, load, index) for index, load in enumerate(body.pressures))
-        yield from ((body, load, load.name) for load in body.cavities)
+        yield from ((body, index, load) for _, index, load in body.numbered_loads if load.arrows == layer)
 
 
 def _fields(record) -> dict:

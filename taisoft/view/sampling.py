@@ -8,7 +8,7 @@ from taisoft.errors import OutputError, SceneError, SimulationError, reworded
 from taisoft.output.connection_lines import ConnectionLines
 from taisoft.output.nodal_fields import NodalValues
 from taisoft.scene.loads import Cavity, value_at
-from taisoft.view.drawn import ENERGIES, DrawnScene, DrawnState, pressing, some
+from taisoft.view.drawn import ENERGIES, DrawnScene, DrawnState, some, with_arrows
 
 MAX_SEGMENTS = 400  # of springs and tendons, in all
 MAX_CONTACTS = 1000  # that are drawn
@@ -40,19 +40,20 @@ class Sampler:
         with reworded((SceneError, SimulationError), "the scene cannot be shown: ", raised=OutputError):
             state.poses = {one.name: one.pose(time) for one in scene.obstacles if one.path is not None}
             if "tractions" in layers:
-                state.tractions = [value_at(t, time, body.name) for body in scene.bodies for t in body.tractions]
+                found = with_arrows(scene, "tractions")
+                state.tractions = [load.shown(value_at(load, time, body.name)) for body, _, load in found]
             if "connections" in layers and self._lines is not None:
                 state.segments = self._lines.points(x, time)[self._ends], self._lines.tensions(sim)[self._line]
             if "pressures" in layers:
-                state.pressures = [_pressure(sim, *one) for one in pressing(scene)]
+                state.pressures = [_pressure(sim, *one) for one in with_arrows(scene, "pressures")]
         if "contacts" in layers:
             found, k = sim.contacts(), slice(0, MAX_CONTACTS)
             state.contacts = {name: getattr(found, name)[k] for name in ("point", "normal", "impulse")}
         return state
 
 
-def _pressure(sim, body, load, key) -> float:
+def _pressure(sim, body, index, load) -> float:
     """Return a present pressure [Pa]; that of a cavity may be found by the simulation."""
     if isinstance(load, Cavity):
-        return float(sim.cavity_pressure(key))
-    return float(value_at(load, sim.time, f"body {body.name!r}: pressure {key}"))
+        return float(sim.cavity_pressure(load.name))
+    return float(load.shown(value_at(load, sim.time, f"body {body.name!r}: {load.kind} {index}")))

@@ -141,7 +141,7 @@ def test_bad_cavities_are_refused(arguments, message):
     body = bare().bodies[0]
     with pytest.raises(SceneError, match=f"^body 'ball': add_cavity: {message}"):
         body.add_cavity(**{"where": inside(MESH, 1.0), **arguments})
-    assert body.cavities == []
+    assert body.cavities == ()
 
 
 def test_cavities_must_not_overlap_and_have_names_of_their_own():

@@ -185,7 +185,7 @@ def test_bad_loads_are_refused(kind, where, value, message):
     body = ts.Scene().add_body(cube(), rubber(), name="body")
     with pytest.raises(SceneError, match=f"^body 'body': add_{kind}: {message}"):
         getattr(body, f"add_{kind}")(where, value)
-    assert body.loads == []
+    assert body.loads == ()
 
 
 def failing(at_first, later):

@@ -185,7 +185,7 @@ def test_bad_input_is_refused(arguments, message):
     scene = ts.Scene()
     with pytest.raises(SceneError, match=rf"^body 'beam': {message}"):
         scene.add_body(**({"mesh": MESH, "material": rubber(), "name": "beam"} | arguments))
-    assert scene.bodies == []
+    assert scene.bodies == ()
 
 
 @pytest.mark.parametrize(

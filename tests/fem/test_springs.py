@@ -121,7 +121,7 @@ def test_short_elements_have_smooth_forces(part):
 @pytest.mark.parametrize("stiffness, tension, order", [(1.0, 1.0, 1), (3e5, 1.0, 1), (1.0, 1e6, 1), (3e4, 1.0, 2)])
 def test_stable_dt_is_a_lower_bound_of_the_limit(stiffness, tension, order):
     scene = connected_scene(order)
-    scene.tendons.clear()
+    scene.remove(*scene.tendons)
     scene.add_tendon([("a", 5), ("b", (0.7, 0.0, 0.1))], tension)
     scene.add_spring(("a", 7), ("b", (0.9, 0.2, -0.1)), stiffness, name="strong")
     oracle = Oracle(scene)

@@ -28,7 +28,7 @@ def on_sphere(mesh: ts.TetMesh) -> None:
 def test_round_trips(name, tmp_path):
     ts.write_mesh(tmp_path / name, MESH)
     again = ts.read_mesh(tmp_path / name)
-    assert again.warnings == [] and np.array_equal(again.tets, MESH.tets) and np.array_equal(again.regions, MESH.regions)
+    assert again.warnings == () and np.array_equal(again.tets, MESH.tets) and np.array_equal(again.regions, MESH.regions)
     assert np.array_equal(again.vertices, MESH.vertices) and np.array_equal(again.mid_edge, MIDDLES)
     on_sphere(again)
 

@@ -19,7 +19,7 @@ def test_fibres_are_read_back(tmp_path, ending, regions):
     mesh = ts.TetMesh(BOX.vertices, BOX.tets, regions=regions, fibres=FIBRES)
     ts.write_mesh(tmp_path / f"a{ending}", mesh)
     again = ts.read_mesh(tmp_path / f"a{ending}")
-    assert np.array_equal(again.fibres, FIBRES) and np.array_equal(again.tets, BOX.tets) and again.warnings == []
+    assert np.array_equal(again.fibres, FIBRES) and np.array_equal(again.tets, BOX.tets) and again.warnings == ()
     assert (again.regions is None) == (regions is None) and not again.fibres.flags.writeable
     assert np.array_equal(ts.TetMesh.from_meshio(mesh.to_meshio()).fibres, FIBRES)
 

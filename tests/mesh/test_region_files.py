@@ -29,7 +29,7 @@ def test_random_regions_are_read_back(tmp_path, data):
     mesh = ts.TetMesh(BOX.vertices, BOX.tets, regions=ids, region_names=dict(zip(sorted(set(ids)), names)))
     path, record = tmp_path / "part.msh", mesh.to_meshio()
     again = ts.TetMesh.from_meshio(record)
-    assert again.regions.tolist() == ids and again.region_names == mesh.region_names and again.warnings == []
+    assert again.regions.tolist() == ids and again.region_names == mesh.region_names and again.warnings == ()
     assert np.array_equal(again.vertices, BOX.vertices) and np.array_equal(again.tets, BOX.tets)
     record.points[:] = 0.0  # its own copy
     if not any(ids):
@@ -38,7 +38,7 @@ def test_random_regions_are_read_back(tmp_path, data):
         return
     ts.write_mesh(path, mesh)
     again = ts.read_mesh(path)
-    assert again.regions.tolist() == ids and again.region_names == mesh.region_names and again.warnings == []
+    assert again.regions.tolist() == ids and again.region_names == mesh.region_names and again.warnings == ()
     assert np.array_equal(again.vertices, BOX.vertices) and np.array_equal(again.tets, BOX.tets)
     ts.write_mesh(path, mesh, regions=False)
     assert ts.read_mesh(path).regions is None
@@ -97,7 +97,7 @@ def test_names_are_kept_or_changed_with_a_warning(tmp_path):
     ids, path = [-1] * 4 + [0] * 4 + [7] * 2, tmp_path / "a.msh"
     for binary in (False, True):
         mesh = ts.read_mesh(named_file(path, {-1: "l'os", 0: " two  blanks", 7: "7"}, ids, binary))
-        assert mesh.regions.tolist() == ids and mesh.warnings == []
+        assert mesh.regions.tolist() == ids and mesh.warnings == ()
         assert mesh.region_names == {-1: "l'os", 0: " two  blanks", 7: "7"}
     for names, encoding, found, message in (
         ({1: "a", 2: "a"}, "utf-8", {1: "a (1)", 2: "a (2)"}, r"region 2 is called 'a \(2\)' instead of 'a'$"),

@@ -74,7 +74,7 @@ def test_pattern_five_alternates_like_a_checkerboard_and_six_shares_the_diagonal
 def test_a_ball_is_round_and_well_shaped(cells):
     center = np.array([1.0, 2.0, -3.0])
     mesh = ball_mesh(0.7, cells, center)
-    assert mesh.n_tets == 6 * cells**3 and mesh.warnings == []
+    assert mesh.n_tets == 6 * cells**3 and mesh.warnings == ()
     radii = np.linalg.norm(mesh.vertices - center, axis=1)
     assert radii[np.unique(mesh.surface)] == pytest.approx(0.7)
     assert radii.max() <= 0.7 * (1 + 1e-12)

@@ -121,7 +121,7 @@ def test_merging_is_transitive_and_keeps_the_order_and_components_are_counted():
     assert merged_points(points, 1.0)[1].tolist() == [0, 1, 1, 1, 1, 1]
     for shift, n_verts, n_components in (((5, 0, 0), 16, 2), ((1, 0, 0), 12, 1)):
         mesh = two_boxes(shift)
-        assert mesh.n_verts == n_verts and mesh.n_components == n_components and mesh.warnings == []
+        assert mesh.n_verts == n_verts and mesh.n_components == n_components and mesh.warnings == ()
 
 
 @pytest.mark.parametrize(

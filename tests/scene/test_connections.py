@@ -117,12 +117,12 @@ def test_bodies_that_a_connection_names_must_stay():
         for removed in "ab":
             scene = two()
             add(scene)
-            scene.bodies.remove(scene.body(removed))
+            scene.remove(scene.body(removed))
             with pytest.raises(SceneError, match=f"^{kind} 'x': no body or obstacle is called '{removed}'"):
                 scene.check()
     scene = two()
     CONNECTIONS["attachment"](scene)
-    scene.bodies.pop(0)
+    scene.remove(scene.bodies[0])
     scene.add_obstacle(ts.Sphere((50, 0, 0), 1.0), name="a")
     with pytest.raises(SceneError, match="^attachment 'x': 'a' is no longer the body whose nodes are attached"):
         scene.check()
@@ -185,14 +185,14 @@ def connected() -> ts.Scene:
 
 RAMP = ts.KeyFrames((0.0, 0.01), values=(10.0, 60.0))
 CHANGES = [
-    lambda s: s.springs.pop(0),
+    lambda s: s.remove(s.springs[0]),
     lambda s: s.add_spring(A, ("b", (0.2, 0.1, 0)), 1.0, name="new"),
     *(lambda s, n=n, k=k: s.attach("a", [n], "pin", k, name="new") for n, k in ((0, 1.0), (1, 1.0), (0, 2.0))),
-    lambda s: s.tendons.pop(),
-    lambda s: (s.tendons.pop(), s.add_tendon([("a", 3), ("b", 5)], RAMP, name="other")),
-    lambda s: (s.tendons.pop(), s.add_tendon([("a", 3), ("b", 6)], 3.0, name="other")),
-    lambda s: (s.tendons.pop(), s.add_tendon([("a", 3), ("b", 5)], length=3.0, name="other")),
-    lambda s: (s.tendons.pop(), s.add_tendon([("a", 3), ("b", 5)], length=3.0, stiffness=1.0, name="other")),
+    lambda s: s.remove(s.tendons[-1]),
+    lambda s: (s.remove(s.tendons[-1]), s.add_tendon([("a", 3), ("b", 5)], RAMP, name="other")),
+    lambda s: (s.remove(s.tendons[-1]), s.add_tendon([("a", 3), ("b", 6)], 3.0, name="other")),
+    lambda s: (s.remove(s.tendons[-1]), s.add_tendon([("a", 3), ("b", 5)], length=3.0, name="other")),
+    lambda s: (s.remove(s.tendons[-1]), s.add_tendon([("a", 3), ("b", 5)], length=3.0, stiffness=1.0, name="other")),
     lambda s: setattr(s.body("a"), "position", (0, 0, 1)),
     lambda s: setattr(s.body("a"), "velocity", (0, 0, 1)),
     lambda s: setattr(s.body("a"), "young", np.linspace(1e3, 1e4, 5)),

@@ -39,7 +39,7 @@ def copies(one) -> tuple:
     return one, copy.copy(one), copy.deepcopy(one), pickle.loads(pickle.dumps(one))
 
 
-REMOVE = "remove it from its list and add another"
+REMOVE = "call scene.remove and add another"
 ANOTHER = "add another body by scene.add_body"
 
 
@@ -51,7 +51,11 @@ def test_unknown_and_read_only_attributes_are_refused():
             (lambda s: s.body("block"), name, f"body 'block': {name} cannot be set: {ANOTHER}$")
             for name in ("name", "mesh", "order", "dilatation", "nodes", "rest_positions")
         ),
-        (lambda s: s.body("block"), "constraints", "body 'block': constraints cannot be set: call body.fix or body.move$"),
+        (
+            lambda s: s.body("block"),
+            "constraints",
+            "body 'block': constraints cannot be set: call body.fix, body.move or body.remove$",
+        ),
         (lambda s: s.body("block"), "contact_mode", "body 'block': contact_mode cannot be set: set body.collision$"),
         (lambda s: s.body("block").material, "young", "material: young cannot change: .*sim.set_material.body, young=...."),
         (lambda s: s.obstacle("ball"), "friction", "obstacle 'ball': friction cannot change: .*scene.set_contact"),
@@ -107,15 +111,24 @@ def test_assignments_are_checked_as_by_add_body():
 def test_lists_grow_by_methods_only_and_items_can_be_removed():
     scene = loaded()
     changes = {"append": ["foo"], "insert": [0, 1], "extend": [[1]], "__iadd__": [[1]], "__setitem__": [slice(None), []]}
-    for one, name, call in ((scene, "bodies", "scene.add_body"), (scene.bodies[0], "constraints", "body.fix or body.move")):
+    body = scene.bodies[0]
+    for one, name, call in (
+        (scene, "bodies", "scene.add_body or scene.remove"),
+        (body, "constraints", "body.fix, body.move or body.remove"),
+        (body, "forces", "body.add_force or body.remove"),
+    ):
         items = getattr(one, name)
-        before = list(items)
+        before = tuple(items)
         for change, values in changes.items():
             with pytest.raises(SceneError, match=f": {name} cannot be changed by hand: call {call}$"):
                 getattr(items, change)(*values)
-        with pytest.raises(SceneError, match=f": {name} cannot be deleted: call {call}$"):
+        with pytest.raises(AttributeError):
             delattr(one, name)
-        assert items == before and items.pop() is before[-1] and getattr(one, name) == before[:-1]
+        assert items == before
+        one.remove(before[-1])
+        assert getattr(one, name) == before[:-1]
+        with pytest.raises(SceneError, match=": remove: .* is none of its"):
+            one.remove(before[-1])
     for change in (lambda: scene.contact_pairs.update({1: 2}), lambda: setattr(scene, "contact_pairs", {})):
         with pytest.raises(SceneError, match="^scene: contact_pairs cannot be .*: call scene.set_contact"):
             change()
@@ -147,7 +160,7 @@ CHANGES = {
     "collision": (lambda s: setattr(s, "collision", ts.CollisionSettings()), "scene.snapshot"),
     "contact_forces": (lambda s: setattr(s, "contact_forces", True), "make a new Simulator"),
     "add_body": (lambda s: s.add_body(cube((0, 5, 0)), rubber()), "scene.snapshot"),
-    "bodies": (lambda s: s.bodies.pop(), "scene.snapshot"),
+    "remove": (lambda s: s.remove(*s.springs), "scene.snapshot"),
     "velocity": (lambda s: setattr(s.body("block"), "velocity", np.zeros(3)), "call sim.set_state"),
     "set_contact": (lambda s: s.set_contact("block", "ball", friction=1), "call sim.set_contact"),
     "add_tendon": (lambda s: s.add_tendon([("block", 0), ("other", 1)], 1.0), "call sim.set_tension"),
@@ -168,7 +181,7 @@ def test_changes_to_a_frozen_scene_are_refused_and_to_its_copies_allowed(frozen,
         assert target.gravity.tolist() == before.gravity.tolist() and target.contact_pairs == before.contact_pairs
         assert [b.name for b in target.bodies] == ["block", "other"] and len(target.body("block").forces) == 1
     picklable = scene.snapshot()
-    del picklable.body("block").constraints[1:]  # its path is a lambda
+    picklable.body("block").remove(*picklable.body("block").constraints[1:])  # its path is a lambda
     pickled = pickle.loads(pickle.dumps(picklable))
     for copied in (before.snapshot(), scene.snapshot(), copy.deepcopy(scene), pickled, with_order(scene, 1)):
         change(copied)

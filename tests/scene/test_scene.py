@@ -191,7 +191,7 @@ def test_nodes_and_triangles_are_selected_by_ids_masks_and_functions(scene):
     assert len(body.fix(lambda X: np.add(X, 1.0, out=X)[:, 0] > 1.4).nodes) == 9 and body.rest_positions.max() == 0.5  # a copy
     load = body.add_traction(lambda c: c[:, 1] > 0.49, (0, 2000, 0))
     assert load.triangles.tolist() == np.flatnonzero((MESH.vertices[MESH.surface][:, :, 1] > 0.49).all(axis=1)).tolist()
-    assert body.tractions == [load] and load.value.tolist() == [0, 2000, 0]
+    assert body.tractions == (load,) and load.value.tolist() == [0, 2000, 0]
 
 
 def test_contradicting_constraints_are_refused(scene):

@@ -205,7 +205,7 @@ def test_runs_that_have_to_foresee_motion_refuse_commands(refusing):
 
 def test_a_path_that_follows_commands_is_referred_to_set_pose_and_one_that_jumps_warns():
     made, now = scene(), [0.0]
-    made.obstacles.pop()
+    made.remove(made.obstacles[-1])
     made.add_obstacle(ts.Sphere((1, 1, 1), 0.1), name="jaw", path=lambda t: ((now[0], 0, 0), np.eye(3)))
     made.add_obstacle(ts.Sphere((3, 1, 1), 0.1), name="jumper", path=lambda t: ((t > 1.3 * DT, 0, 0), np.eye(3)))
     loose = made.add_rigid_body(ts.box_mesh((1, 1, 1), (1, 1, 1)), name="loose", position=(9, 9, 9))

@@ -105,7 +105,7 @@ def test_checkpoints_and_rebuilt_simulators_keep_changed_loads(sims, tmp_path):
     late, names = path(sim, 3), ("rope", "band", "hook")
     numbers = sim.energies().loads, *(sim.joint_force(name) for name in names)
     assert np.array_equal(late, expected[3:]) and numbers[1] == NEXT[4]
-    with pytest.raises(SceneError, match="beam.force.0 is .0.0, -20.0, 5.0. in this scene and was .0.0, 0.0, 0.0. at"):
+    with pytest.raises(SceneError, match="beam.traction.0 is .0.0, 0.0, 700.0. in this scene and was .0.0, 30.0, 0.0. at"):
         ts.Simulator.load_checkpoint(tmp_path / "c.npz", beam(NEXT))
     with pytest.raises(SceneError, match="differs in body 'beam': loads"):
         ts.Simulator.load_checkpoint(tmp_path / "c.npz", beam(end=2e4))

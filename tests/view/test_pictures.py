@@ -81,7 +81,7 @@ def test_a_scene_travels_whole():
     scene.lights, scene.camera = [ts.Light((0, -1, 0))], ts.Camera((1, 2, 3), fov=[20, 30], times=[0, 1], follow="one")
     scene.body("held").colour, scene.body("moved").opacity = "#ff0000", 0.5
     for body in scene.bodies[1:]:
-        body.constraints.clear()
+        body.remove(*body.constraints)
     scene.body("moved").move([0], lambda t: (0, t, 0))
     scene.add_spring(("one", 0), ("two", 0), 1.0)
     scene.add_obstacle(ts.HalfSpace((0, -2, 0), (0, 1, 0)), colour=(0, 0, 1), opacity=0.25)
