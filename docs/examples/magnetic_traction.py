@@ -19,6 +19,7 @@ class MagneticTraction(BodyLoad):
     """A dead load on surface triangles; its value is the field B [T]."""
 
     items: ClassVar[str] = "triangles"
+    own: ClassVar[tuple[str, ...]] = ("magnetisation",)
     triangles: np.ndarray  #: (k,) rows of mesh.surface
     magnetisation: np.ndarray  #: (3,) [A/m]
 

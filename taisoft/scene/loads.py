@@ -5,9 +5,8 @@ acts, how scene files and checkpoints hold it, what a running simulation may cha
 the forces of a dead load on nodes from its row of `WEIGHTS` in `taisoft.fem.loads`.
 """
 
-import inspect
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
@@ -54,14 +53,15 @@ class BodyLoad(Load):
     """A load on nodes or surface triangles of a body.
 
     Its class has `of(body, what, where, ...)`, which makes it: where as in `Body.fix`, or for triangles as in `add_traction`,
-    then the load's own arguments, which `Body.add_load` and scene files take. what: start of messages. Arguments are fields of
-    the same name, but for the one that gives value and path, whose name is `given`.
+    then the load's own arguments, which `Body.add_load` and scene files take. what: start of messages. Those in `own` are fields;
+    of the others one is given, whose name is `given`, and holds value or path.
     """
 
     kind: ClassVar[str]  #: its name for `Body.add_load`, `Simulator.set_load` and in scene files
     items: ClassVar[str]  #: what it acts on, and its field for these: "nodes" or "triangles"
     feature: ClassVar[str] = DEAD  #: of the plan
     arrows: ClassVar[str] = ""  #: layer of pictures that shows it; "": none
+    own: ClassVar[tuple[str, ...]] = ()  #: arguments besides `where` and the value
 
     @property
     def ids(self) -> np.ndarray:
@@ -71,13 +71,7 @@ class BodyLoad(Load):
     @property
     def arguments(self) -> dict:
         """What `Body.add_load` was given, with ids instead of a function."""
-        own = [name for name in inspect.signature(type(self).of).parameters if name in self.own_fields()]
-        return {**{name: getattr(self, name) for name in own}, "where": self.ids, self.given: self.given_value}
-
-    @classmethod
-    def own_fields(cls) -> set[str]:
-        """Return the names of the fields of its kind alone, but for what it acts on."""
-        return {one.name for one in fields(cls)} - {one.name for one in fields(ScalarLoad)} - {cls.items, "where"}
+        return {**{name: getattr(self, name) for name in self.own}, "where": self.ids, self.given: self.given_value}
 
     @property
     def numbers(self) -> tuple[str, ...]:
@@ -174,6 +168,7 @@ class Cavity(BodyLoad, ScalarLoad):
     items: ClassVar[str] = "triangles"
     feature: ClassVar[str] = FOLLOWER
     arrows: ClassVar[str] = "pressures"
+    own: ClassVar[tuple[str, ...]] = ("name",)
     name: str
     triangles: np.ndarray  #: (k,) int64 rows of mesh.surface
     rest_volume: float  #: [m^3]

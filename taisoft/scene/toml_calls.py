@@ -53,7 +53,7 @@ def body_calls() -> dict[str, Call]:
     """Return the calls of bodies by key, those of all kinds of loads included."""
     calls = [Call("fix", "fix"), Call("move", "move"), Call("activate", "activate", varying=("activation",))]
     for kind, load in LOADS.items():
-        of_value = set(arguments_of(load.of, "body", "what", "where")[0]) - load.own_fields()
+        of_value, _ = arguments_of(load.of, "body", "what", "where", *load.own)
         calls.insert(-1, Call(kind, "add_load", load.items, tuple(of_value)))
     return {one.key: one for one in calls}
 

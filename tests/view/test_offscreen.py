@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import taisoft as ts
+from taisoft.attributes import thawed
 from taisoft.backend.runtime import open_kind, open_runtime
 from taisoft.errors import OutputError, SimulationError
 from taisoft.mesh.placing import FROM_Y_UP
@@ -217,7 +218,8 @@ def test_a_transparent_body_shows_what_is_behind_it():
     middle = np.array([image[SIZE[1] // 2 - 3, SIZE[0] // 2] for image in images])
     assert (np.diff(middle[:, 0]) < -30).all() and (np.diff(middle[:, 2]) > 30).all()
     scene = walls(0.6)
-    scene._hold("bodies", scene.bodies[::-1])
+    with thawed(scene):
+        scene.bodies = scene.bodies[::-1]
     assert np.abs(Offscreen(scene, SIZE, FRONT).image(FakeSimulator(scene)) - images[1]).max() <= 1
     surfaces = Surfaces(scene)
     assert set(surfaces.opacities[(surfaces.colours == MARKER_COLOUR).all(axis=1)]) == {0.6, 1.0}
@@ -276,7 +278,8 @@ def test_a_process_has_one_window_which_leaves_no_files(tmp_path, monkeypatch):
 def test_the_window_blends_transparent_surfaces_from_far_to_near():
     """As pictures do, to a few pixels, in whatever order the bodies were added."""
     scenes = walls(0.5), walls(0.5)
-    scenes[1]._hold("bodies", scenes[1].bodies[::-1])
+    with thawed(scenes[1]):
+        scenes[1].bodies = scenes[1].bodies[::-1]
     for scene in scenes:
         drawing = Offscreen(scene, SIZE, FRONT)
         state = sampled(FakeSimulator(scene))
