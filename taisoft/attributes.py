@@ -9,6 +9,7 @@ import dataclasses
 import difflib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from typing import ClassVar, dataclass_transform
 
 import numpy as np
@@ -179,7 +180,8 @@ def thawed(*items: Guarded) -> Iterator[None]:
 def guarded_record(
     what: str, instead: str, error: type[Exception] = SceneAttributeError, eq: bool = False
 ) -> Callable[[type], type]:
-    """Return a decorator that makes a class a frozen dataclass with the messages of `Guarded` and read-only arrays.
+    """Return a decorator that makes a class a frozen dataclass with the messages of `Guarded`, `checked` fields, and read-only
+    arrays.
 
     what: its label in messages, followed by its name if it has one; instead: what to do instead of changing an attribute, with
     {name} for the attribute; eq: whether records are compared by value. Those that are not have the repr `short_repr`.
@@ -193,19 +195,25 @@ def guarded_record(
                 if isinstance(value, np.ndarray):
                     value.setflags(write=False)
 
+        def label(self) -> str:
+            own_name = getattr(self, "name", None)
+            return what if own_name is None else f"{what} {own_name!r}"
+
         def check_and_protect(self) -> None:
+            for field in dataclasses.fields(self):
+                value = getattr(self, field.name)
+                if "check" in field.metadata and not (value is None is field.default):
+                    object.__setattr__(self, field.name, field.metadata["check"](value, f"{label(self)}: {field.name}"))
             if check is not None:
                 check(self)
             make_read_only(self)
 
         def refuse(self, name: str, value=None) -> None:
-            own_name = getattr(self, "name", None)
-            label = what if own_name is None else f"{what} {own_name!r}"
             known = _public(self)
             if name in known:
-                raise error(f"{label}: {name} cannot change: {instead.format(name=name)}")
+                raise error(f"{label(self)}: {name} cannot change: {instead.format(name=name)}")
             if type(self) is cls:
-                raise error(unknown(label, name, known, {}))
+                raise error(unknown(label(self), name, known, {}))
             object.__setattr__(self, name, value)  # an attribute of a subclass
 
         def set_state(self, state: dict) -> None:
@@ -220,6 +228,11 @@ def guarded_record(
         return cls
 
     return guard
+
+
+def checked(check: Callable, default=dataclasses.MISSING, **limits):
+    """Return a field of a `guarded_record` that holds check(value, "LABEL: NAME", **limits) of what is given, or a default None."""
+    return dataclasses.field(default=default, metadata={"check": partial(check, **limits)})
 
 
 def unknown(what: str, name: str, known: set[str], instead: dict[str, str]) -> str:

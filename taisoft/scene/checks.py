@@ -82,6 +82,11 @@ def unit(vector: np.ndarray, rule: str) -> np.ndarray:
     return scaled / np.linalg.norm(scaled)
 
 
+def direction(value, what: str) -> np.ndarray:
+    """Return a (3,) vector, not zero, as a unit vector."""
+    return unit(vector(value, what), f"{what} must not be zero")
+
+
 def path_value(path: Callable, t: float, what: str, quantity: str, shapes: tuple[tuple[int, ...], ...]) -> np.ndarray | None:
     """Return what a path, a function of time [s], gives at t, checked as `array` does; None for None.
 

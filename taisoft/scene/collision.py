@@ -9,7 +9,7 @@ request.
 
 import numpy as np
 
-from taisoft.attributes import guarded_record
+from taisoft.attributes import checked, guarded_record
 from taisoft.errors import MeshError, SceneError
 from taisoft.mesh.nodes import Nodes
 from taisoft.mesh.topology import normals_and_heights, opposite_half_edges
@@ -17,6 +17,7 @@ from taisoft.scene import checks
 
 BROAD_PHASES = ("auto", "spatial_hash", "bvh")
 CONTACT_MODES = ("auto", "distance_field", "proximity")
+CAPACITIES = range(64, 2**31)
 SHARP = 60.0  # [degrees] between adjacent face normals above which a convex edge is sharp
 
 
@@ -26,35 +27,27 @@ SHARP = 60.0  # [degrees] between adjacent face normals above which a convex edg
 class CollisionSettings:
     """Settings of contact detection. Raises SceneError for numbers outside the rules below."""
 
-    broad_phase: str = "auto"  #: "auto", "spatial_hash" or "bvh"; auto: bvh on the CPU for up to 200 colliders, else the hash
-    cell_ratio: float = 2.2  #: edge of a hash cell over the mean surface edge, > 0
-    margin: float | None = None  #: distance within which contacts are reported [m], >= 0; None: 0.1 of the mean surface edge
+    broad_phase: str = checked(
+        checks.choice, "auto", allowed=BROAD_PHASES
+    )  #: "auto", "spatial_hash" or "bvh"; auto: bvh on the CPU for up to 200 colliders, else the hash
+    cell_ratio: float = checked(checks.number, 2.2, above=0.0)  #: edge of a hash cell over the mean surface edge, > 0
+    #: distance within which contacts are reported [m], >= 0; None: 0.1 of the mean surface edge
+    margin: float | None = checked(checks.number, None, minimum=0.0, unit="m")
     #: gap that contacts keep, over the finest body's mean surface edge, 1e-5 to 0.1; None: 2e-3, in statics where bodies meet
     #: half-spaces alone 2e-5
-    offset: float | None = None
-    k_dop: int = 6  #: planes of the boxes of "bvh": 6, 14 or 18
-    field_cells: int = 32  #: cells of a distance field along a body's longest side, 8 to 256
-    initial_capacity: int | None = None  #: of the buffers of pairs and contacts, at least 64; None: from the surface
-    max_capacity: int | None = None  #: of any buffer; None: what the memory holds
+    offset: float | None = checked(checks.number, None, minimum=1e-5, maximum=0.1)
+    k_dop: int = checked(checks.whole, 6, allowed=(6, 14, 18))  #: planes of the boxes of "bvh": 6, 14 or 18
+    field_cells: int = checked(
+        checks.whole, 32, allowed=range(8, 257)
+    )  #: cells of a distance field along a body's longest side, 8 to 256
+    #: of the buffers of pairs and contacts, at least 64; None: from the surface
+    initial_capacity: int | None = checked(checks.whole, None, allowed=CAPACITIES)
+    max_capacity: int | None = checked(checks.whole, None, allowed=CAPACITIES)  #: of any buffer; None: what the memory holds
 
     def __post_init__(self):
-        what = "collision settings"
-        checks.choice(self.broad_phase, f"{what}: broad_phase", BROAD_PHASES)
-        validated = {
-            "cell_ratio": checks.number(self.cell_ratio, f"{what}: cell_ratio", above=0.0),
-            "k_dop": checks.whole(self.k_dop, f"{what}: k_dop", (6, 14, 18)),
-            "field_cells": checks.whole(self.field_cells, f"{what}: field_cells", range(8, 257)),
-        }
-        if self.offset is not None:
-            validated["offset"] = checks.number(self.offset, f"{what}: offset", minimum=1e-5, maximum=0.1)
-        if self.margin is not None:
-            validated["margin"] = checks.number(self.margin, f"{what}: margin", minimum=0.0, unit="m")
-        for field in ("initial_capacity", "max_capacity"):
-            if getattr(self, field) is not None:
-                validated[field] = checks.whole(getattr(self, field), f"{what}: {field}", range(64, 2**31))
-        if validated.get("initial_capacity", 0) > validated.get("max_capacity", 2**31):
-            raise SceneError(f"{what}: initial_capacity {self.initial_capacity} must not exceed max_capacity {self.max_capacity}")
-        checks.store(self, **validated)
+        if (self.initial_capacity or 0) > (self.max_capacity or CAPACITIES.stop):
+            rule = f"initial_capacity {self.initial_capacity} must not exceed max_capacity {self.max_capacity}"
+            raise SceneError(f"collision settings: {rule}")
 
 
 def has_sharp_edges(nodes: Nodes) -> bool:

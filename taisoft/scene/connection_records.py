@@ -9,7 +9,8 @@ from typing import ClassVar
 
 import numpy as np
 
-from taisoft.attributes import guarded_record
+from taisoft.attributes import checked, guarded_record
+from taisoft.scene.checks import number
 from taisoft.scene.loads import ScalarLoad
 
 MAX_OUTSIDE = 0.1  # heights of a tet by which a point may lie outside a body: curved surfaces do not meet exactly
@@ -30,9 +31,9 @@ class Spring:
 
     name: str
     points: tuple[Point, Point]
-    stiffness: float  #: [N/m]
-    rest_length: float | None  #: [m]; None: the distance of the points at the start
-    damping: float  #: [N s/m]
+    stiffness: float = checked(number, minimum=0.0, unit="N/m")  #: [N/m]
+    rest_length: float | None = checked(number, None, minimum=0.0, unit="m")  #: [m]; None: the points' distance at the start
+    damping: float = checked(number, 0.0, minimum=0.0, unit="N s/m")  #: [N s/m]
     numbers: ClassVar = ("stiffness", "rest_length", "damping")  #: that may change
 
     @property
@@ -58,7 +59,7 @@ class Tendon(ScalarLoad):
     name: str
     points: tuple[Point, ...]
     given: str = "force"  #: "force" or "length": what its value is
-    stiffness: float | None = None  #: [N/m] of one of given length; None: inextensible
+    stiffness: float | None = checked(number, None, above=0.0, unit="N/m")  #: [N/m] of one of given length; None: inextensible
     damping: ClassVar[float] = 0.0  #: [N s/m]
     owners = Spring.owners
     numbers: ClassVar = ("force", "length", "stiffness")
@@ -91,8 +92,10 @@ class Attachment:
     a: str
     nodes: np.ndarray  #: (k,) int64 node ids of body a
     b: str  #: name of a body or obstacle
-    stiffness: float | None  #: [N/m] of each node's spring; None: it moves with b exactly
-    damping: float = 0.0  #: [N s/m] of each node
+    stiffness: float | None = checked(
+        number, None, above=0.0, unit="N/m"
+    )  #: of each node's spring; None: it moves with b exactly
+    damping: float = checked(number, 0.0, minimum=0.0, unit="N s/m")  #: of each node
     where: Callable | None = None  #: as in `Constraint`
     reach: float = MAX_OUTSIDE  #: heights of a tet by which the nodes may lie outside body b
     numbers: ClassVar = ("stiffness", "damping")

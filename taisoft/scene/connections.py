@@ -42,10 +42,6 @@ def add_spring(
     _check_any_body(self, points, what)
     if points[0].owner == points[1].owner and coincide(self, *points):
         raise SceneError(f"{what}: a and b are the same point of body {points[0].owner!r}")
-    stiffness = checks.number(stiffness, f"{what}: stiffness", minimum=0.0, unit="N/m")
-    if rest_length is not None:
-        rest_length = checks.number(rest_length, f"{what}: rest_length", minimum=0.0, unit="m")
-    damping = checks.number(damping, f"{what}: damping", minimum=0.0, unit="N s/m")
     return self._add("springs", Spring(name, points, stiffness, rest_length, damping))
 
 
@@ -69,10 +65,8 @@ def add_tendon(
     _check_any_body(self, made, what)
     _check_distinct(self, made, what)
     given, content = either(what, force=force, length=length)
-    if stiffness is not None:
-        if given == "force":
-            raise SceneError(f"{what}: stiffness is that of a tendon of given length: give a length instead of a force")
-        stiffness = checks.number(stiffness, f"{what}: stiffness", above=0.0, unit="N/m")
+    if stiffness is not None and given == "force":
+        raise SceneError(f"{what}: stiffness is that of a tendon of given length: give a length instead of a force")
     tendon = Tendon(name, made, given, stiffness, **value_or_path(content, what, given, Tendon.shapes))
     check_tendon(tendon, tendon.path(0.0) if tendon.value is None else tendon.value, what)
     return self._add("tendons", tendon)
@@ -103,12 +97,9 @@ def attach(
     if b == a:
         raise SceneError(f"{what}: body {a!r} cannot be attached to itself")
     owner = _owner(self, b, what)
-    if stiffness is not None:
-        stiffness = checks.number(stiffness, f"{what}: stiffness", above=0.0, unit="N/m")
-    damping = checks.number(damping, f"{what}: damping", minimum=0.0, unit="N s/m")
+    attachment = Attachment(name, body.name, nodes, owner.name, stiffness, damping, where if callable(where) else None)
     if stiffness is None and damping > 0.0:
         raise SceneError(f"{what}: damping is that of springs: give a stiffness, too")
-    attachment = Attachment(name, body.name, nodes, owner.name, stiffness, damping, where if callable(where) else None)
     if isinstance(owner, Body):
         locate_nodes(self, attachment)
     return self._add("attachments", attachment)

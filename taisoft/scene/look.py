@@ -5,7 +5,7 @@ import math
 import numpy as np
 import scipy
 
-from taisoft.attributes import guarded_record
+from taisoft.attributes import checked, guarded_record
 from taisoft.errors import SceneError, value_text
 from taisoft.mesh.placing import FROM_Y_UP, UP
 from taisoft.scene import checks
@@ -77,15 +77,11 @@ def _depth(value) -> int:
 class Light:
     """Light from far away, of a scene's `lights`. Raises SceneError."""
 
-    direction: np.ndarray  #: (3,) in which it shines, of any length
-    strength: float = 0.7  #: fraction of its colour that a face perpendicular to it shows
-    colour: np.ndarray | str = (1.0, 1.0, 1.0)  #: sRGB, (3,) in [0, 1] or "#rrggbb"
-
-    def __post_init__(self):
-        direction = checks.array(self.direction, "light: direction", ((3,),))
-        direction = checks.unit(direction, "light: direction must not be zero")
-        strength = checks.number(self.strength, "light: strength", minimum=0.0, maximum=10.0)
-        checks.store(self, direction=direction, strength=strength, colour=colour_of(self.colour, "light: colour"))
+    direction: np.ndarray = checked(checks.direction)  #: (3,) in which it shines, of any length
+    strength: float = checked(
+        checks.number, 0.7, minimum=0.0, maximum=10.0
+    )  #: fraction of its colour that a face perpendicular to it shows
+    colour: np.ndarray | str = checked(colour_of, (1.0, 1.0, 1.0))  #: sRGB, (3,) in [0, 1] or "#rrggbb"
 
 
 @guarded_record("camera", "make a new Camera")
@@ -96,10 +92,10 @@ class Camera:
 
     position: np.ndarray  #: (3,) of the eye [m], or (k,3)
     target: np.ndarray = (0.0, 0.0, 0.0)  #: (3,) [m] in the middle of the picture, or (k,3)
-    up: str | None = None  #: axis that points up, "y" or "z"; None: the scene's
+    up: str | None = checked(checks.choice, None, allowed=tuple(UP))  #: axis that points up, "y" or "z"; None: the scene's
     fov: float | np.ndarray = 45.0  #: vertical field of view [deg], or (k,)
     times: np.ndarray | None = None  #: (k,) ascending [s]; before the first and after the last the camera stays
-    follow: str | None = None  #: name of a body with whose mean displacement the camera moves along
+    follow: str | None = checked(checks.text, None)  #: name of a body with whose mean displacement the camera moves along
 
     def __post_init__(self):
         varying = (self.position, 1), (self.target, 1), (self.fov, 0)
@@ -115,10 +111,6 @@ class Camera:
         if (equal := ~offsets.any(axis=1)).any():
             at = f" at time {times[int(equal.argmax())]:g} s" if times is not None else ""
             raise SceneError(f"camera: position and target must differ, but are the same{at}")
-        if self.up is not None:
-            checks.choice(self.up, "camera: up", tuple(UP))
-        if self.follow is not None:
-            checks.text(self.follow, "camera: follow")
         fov = values["fov"] if values["fov"].ndim else float(values["fov"])
         checks.store(self, **(values | {"fov": fov, "times": times}))
 

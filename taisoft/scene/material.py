@@ -6,9 +6,10 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from taisoft.attributes import FrozenDict, guarded_record
+from taisoft.attributes import FrozenDict, checked, guarded_record
 from taisoft.errors import SceneError, value_text
 from taisoft.scene import checks
+from taisoft.scene.checks import number
 from taisoft.scene.law import Law
 from taisoft.scene.laws import LAWS, registered
 
@@ -60,35 +61,28 @@ class Material:
     """An elastic material with damping and surface parameters. Raises SceneError for values outside the rules below."""
 
     law: str = "stable_neo_hookean"  #: name of a law, such as "st_venant_kirchhoff", "corotational", "mooney_rivlin"
-    young: float = 1e6  #: Young's modulus [Pa], > 0
-    poisson: float = 0.3  #: Poisson's ratio, in the open interval (-1, 0.5)
-    density: float = 1000.0  #: [kg/m^3], > 0
-    friction: float = 0.5  #: Coulomb's coefficient, >= 0
-    restitution: float = 0.0  #: ratio of the normal speeds after and before an impact, 0 to 1
-    mass_damping: float = 0.0  #: [1/s], >= 0
-    stiffness_damping: float = 0.0  #: [s], >= 0
-    volume_floor: float = 0.0  #: J = det F below which the law stiffens against inversion, 0.001 to 1; 0 for none
+    young: float = checked(number, 1e6, above=0.0, unit="Pa")  #: Young's modulus [Pa], > 0
+    poisson: float = checked(number, 0.3)  #: Poisson's ratio, in the open interval (-1, 0.5)
+    density: float = checked(number, 1000.0, above=0.0, unit="kg/m^3")  #: [kg/m^3], > 0
+    friction: float = checked(number, 0.5, minimum=0.0)  #: Coulomb's coefficient, >= 0
+    restitution: float = checked(number, 0.0, minimum=0.0, maximum=1.0)  #: ratio of normal speeds after and before an impact
+    mass_damping: float = checked(number, 0.0, minimum=0.0, unit="1/s")  #: [1/s], >= 0
+    stiffness_damping: float = checked(number, 0.0, minimum=0.0, unit="s")  #: [s], >= 0
+    volume_floor: float = checked(
+        number, 0.0
+    )  #: J = det F below which the law stiffens against inversion, 0.001 to 1; 0 for none
     branches: tuple[tuple[float, float], ...] = ()  #: Maxwell branches, at most 8: relaxation time [s], stiffness over mu
-    fibre_stiffness: float = 0.0  #: k1 [Pa] of fibres, >= 0; at small strains they add 4 k1 to the stiffness along them
-    fibre_exponent: float = 0.0  #: k2 of their exponential stiffening, >= 0; 0: stress linear in Green's strain
-    active_stress: float = 0.0  #: nominal tension [Pa] of fully activated fibres, >= 0
-    active_strain: float = 0.0  #: shortening of fully activated fibres, 0 to below 1
+    fibre_stiffness: float = checked(
+        number, 0.0, minimum=0.0
+    )  #: k1 [Pa] of fibres, >= 0; at small strains they add 4 k1 to the stiffness along them
+    fibre_exponent: float = checked(
+        number, 0.0, minimum=0.0
+    )  #: k2 of their exponential stiffening, >= 0; 0: stress linear in Green's strain
+    active_stress: float = checked(number, 0.0, minimum=0.0)  #: nominal tension [Pa] of fully activated fibres, >= 0
+    active_strain: float = checked(number, 0.0, minimum=0.0)  #: shortening of fully activated fibres, 0 to below 1
     parameters: Mapping[str, float] = dataclasses.field(default_factory=dict, hash=False)  #: numbers of a law that has its own
 
     def __post_init__(self):
-        limits = {
-            "young": {"above": 0.0, "unit": "Pa"},
-            "poisson": {},
-            "density": {"above": 0.0, "unit": "kg/m^3"},
-            "friction": {"minimum": 0.0},
-            "restitution": {"minimum": 0.0, "maximum": 1.0},
-            "mass_damping": {"minimum": 0.0, "unit": "1/s"},
-            "stiffness_damping": {"minimum": 0.0, "unit": "s"},
-            "volume_floor": {},
-            **dict.fromkeys(FIBRE_NUMBERS, {"minimum": 0.0}),
-        }
-        numbers = {k: checks.number(getattr(self, k), f"material: {k}", **limit) for k, limit in limits.items()}
-        checks.store(self, **numbers)
         checks.store(self, branches=_branches(self.branches))
         if not -1.0 < self.poisson < 0.5:
             raise SceneError(f"material: poisson must lie in the open interval (-1, 0.5), not {self.poisson:g}")

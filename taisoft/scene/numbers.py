@@ -22,8 +22,6 @@ from taisoft.scene.scene import Scene
 Numbers = dict[str, float | list | np.ndarray | None]  # of a scene, by name
 Entry = tuple[str, float | list | np.ndarray | None, Callable]  # name, value, and the call that sets it
 NUMBERS = tuple(one.name for one in dataclasses.fields(Material) if one.name not in ("law", "parameters", "branches"))
-LIMITS = dict.fromkeys(("friction", "rest_length", "damping"), {"minimum": 0.0}) | {"stiffness": {"above": 0.0}}
-LIMITS |= {"restitution": {"minimum": 0.0, "maximum": 1.0}}  # of the numbers of obstacles and connections
 
 
 def scene_numbers(scene: Scene) -> Numbers:
@@ -73,7 +71,7 @@ def _entries(scene: Scene) -> Iterator[Entry]:
     exact = scene.exact_attachments
     for kind in ("obstacles", "springs", "tendons", "attachments"):
         for k, one in enumerate(getattr(scene, kind)):
-            for name in LIMITS:
+            for name in one.numbers:
                 if (value := vars(one).get(name)) is not None and one not in exact:
                     yield f"{one.name}.{name}", value, partial(_set_in, scene, kind, k, name)
     for names, pair in scene.contact_pairs.items():
@@ -138,10 +136,7 @@ def _set_rigid(body: RigidBody, given: dict, name: str, value) -> None:
 
 def _set_in(scene: Scene, kind: str, k: int, name: str, value) -> None:
     """Replace a number of an obstacle or a connection, which are records in a list of the scene."""
-    items = getattr(scene, kind)
-    if name in LIMITS:
-        value = checks.number(value, f"{items[k].name!r}: {name}", **LIMITS[name])
-    scene._replace(kind, k, dataclasses.replace(items[k], **{name: value}))
+    scene._replace(kind, k, dataclasses.replace(getattr(scene, kind)[k], **{name: value}))
 
 
 def _set_pair(scene: Scene, ends: str, name: str, value) -> None:

@@ -11,15 +11,16 @@ from typing import ClassVar
 
 import numpy as np
 
-from taisoft.attributes import guarded_record
+from taisoft.attributes import checked, guarded_record
 from taisoft.errors import MeshError, SceneError, reason, reworded, value_text
 from taisoft.mesh.shapes import box_mesh
 from taisoft.mesh.surface_mesh import SurfaceMesh
 from taisoft.mesh.topology import normals_and_heights, opposite_half_edges
 from taisoft.scene import checks
+from taisoft.scene.checks import vector
 from taisoft.scene.commands import Command
 from taisoft.scene.key_frames import KeyFrames, ShapePath
-from taisoft.scene.look import colour_or_none, opacity_of
+from taisoft.scene.look import colour_of, opacity_of
 
 DEGENERATE = 1e-9  # a triangle has no area if its smallest height is below this times its longest edge
 MAKE_ANOTHER = "make another shape; an obstacle moves by its path"
@@ -50,25 +51,15 @@ class Shape:
         """Return vertices (n,3) [m] and outward-oriented triangles (t,3) int64; None for a shape without triangles."""
         return None
 
-    def _check(self, *vectors: str) -> None:
-        """Validate these (3,) fields, and the radius if there is one."""
-        checks.store(self, **{field: checks.vector(getattr(self, field), f"{self.word}: {field}") for field in vectors})
-        if hasattr(self, "radius"):
-            checks.store(self, radius=checks.number(self.radius, f"{self.word}: radius", above=0.0, unit="m"))
-
 
 @guarded_record("half-space", MAKE_ANOTHER)
 class HalfSpace(Shape):
     """All points x with (x - point) . normal <= 0. Raises SceneError for a normal without length."""
 
-    point: np.ndarray  #: (3,) [m] of its boundary
-    normal: np.ndarray  #: (3,), any length; kept as a unit vector
+    point: np.ndarray = checked(vector)  #: (3,) [m] of its boundary
+    normal: np.ndarray = checked(checks.direction)  #: (3,), any length; kept as a unit vector
     kind: ClassVar[int] = 0
     word: ClassVar[str] = "half-space"
-
-    def __post_init__(self):
-        self._check("point", "normal")
-        checks.store(self, normal=checks.unit(self.normal, "half-space: normal must not be zero"))
 
     @property
     def pivot(self) -> np.ndarray:
@@ -84,13 +75,10 @@ class HalfSpace(Shape):
 class Sphere(Shape):
     """A solid sphere. Raises SceneError unless its radius is above 0."""
 
-    center: np.ndarray  #: (3,) [m]
-    radius: float  #: [m]
+    center: np.ndarray = checked(vector)  #: (3,) [m]
+    radius: float = checked(checks.number, above=0.0, unit="m")  #: [m]
     kind: ClassVar[int] = 1
     word: ClassVar[str] = "sphere"
-
-    def __post_init__(self):
-        self._check("center")
 
     def size(self) -> np.ndarray:
         """Return (radius, 0, 0) [m]."""
@@ -101,13 +89,12 @@ class Sphere(Shape):
 class Box(Shape):
     """An axis-aligned box. Raises SceneError unless its half extents are above 0."""
 
-    center: np.ndarray  #: (3,) [m]
-    half_extents: np.ndarray  #: (3,) [m]
+    center: np.ndarray = checked(vector)  #: (3,) [m]
+    half_extents: np.ndarray = checked(vector)  #: (3,) [m]
     kind: ClassVar[int] = 2
     word: ClassVar[str] = "box"
 
     def __post_init__(self):
-        self._check("center", "half_extents")
         if not (self.half_extents > 0).all():
             raise SceneError(f"box: half_extents must be greater than 0 m, not {self.half_extents.tolist()}")
 
@@ -125,14 +112,13 @@ class Box(Shape):
 class Capsule(Shape):
     """All points within a radius of the segment from a to b. Raises SceneError unless the radius is above 0 and a is not b."""
 
-    a: np.ndarray  #: (3,) [m]
-    b: np.ndarray  #: (3,) [m]
-    radius: float  #: [m]
+    a: np.ndarray = checked(vector)  #: (3,) [m]
+    b: np.ndarray = checked(vector)  #: (3,) [m]
+    radius: float = checked(checks.number, above=0.0, unit="m")  #: [m]
     kind: ClassVar[int] = 3
     word: ClassVar[str] = "capsule"
 
     def __post_init__(self):
-        self._check("a", "b")
         checks.unit(self.b - self.a, "capsule: a and b must not be the same point (that is a sphere)")
 
     @property
@@ -222,11 +208,12 @@ class Obstacle:
 
     shape: Shape
     name: str
-    friction: float = 0.5  #: Coulomb's coefficient, >= 0
-    restitution: float = 0.0  #: 0 to 1
+    friction: float = checked(checks.number, 0.5, minimum=0.0)  #: Coulomb's coefficient, >= 0
+    restitution: float = checked(checks.number, 0.0, minimum=0.0, maximum=1.0)  #: 0 to 1
     path: Callable | None = None
-    colour: np.ndarray | None = None  #: sRGB (3,) in pictures, also given as "#rrggbb"; None: grey
-    opacity: float = 1.0  #: 1 hides what is behind
+    colour: np.ndarray | None = checked(colour_of, None)  #: sRGB (3,) in pictures, also given as "#rrggbb"; None: grey
+    opacity: float = checked(opacity_of, 1.0)  #: 1 hides what is behind
+    numbers: ClassVar = ("friction", "restitution")  #: that may change
 
     def __post_init__(self):
         what = f"obstacle {self.name!r}"
@@ -234,10 +221,7 @@ class Obstacle:
             raise SceneError(
                 f"{what}: shape must be a HalfSpace, Sphere, Box, Capsule or MeshObstacle, not {type(self.shape).__name__}"
             )
-        friction, restitution = surface_numbers(self.friction, self.restitution, what)
-        path = ShapePath(self.path, self.shape.pivot) if isinstance(self.path, KeyFrames) else self.path
-        look = {"colour": colour_or_none(self.colour, f"{what}: colour"), "opacity": opacity_of(self.opacity, f"{what}: opacity")}
-        checks.store(self, friction=friction, restitution=restitution, path=path, **look)
+        checks.store(self, path=ShapePath(self.path, self.shape.pivot) if isinstance(self.path, KeyFrames) else self.path)
         if self.path is not None and not callable(self.path):
             raise SceneError(f"{what}: path must be a function of time, not {value_text(self.path)}")
         checks.store(self, given_path=self.path, _start=self.pose(0.0))  # a simulation may replace the path
