@@ -231,7 +231,7 @@ def guarded_record(
 
 
 def checked(check: Callable, default=dataclasses.MISSING, **limits):
-    """Return a field of a `guarded_record` that holds check(value, "LABEL: NAME", **limits) of what is given, or a default None."""
+    """Return a field of a `guarded_record` that holds check(value, "LABEL: NAME", **limits); None, where it is the default."""
     return dataclasses.field(default=default, metadata={"check": partial(check, **limits)})
 
 

@@ -114,8 +114,9 @@ def _read(tables: Table, allow_outside: bool) -> tuple[Scene, dict]:
             meshes[text] = make(table, allow_outside)
         return meshes[text]
 
+    calls = body_calls()
     for name in bodies.known:
-        table = bodies.table(name, [*known, *body_calls(), "materials", "skin"], ["mesh"])
+        table = bodies.table(name, [*known, *calls, "materials", "skin"], ["mesh"])
         body = _add_body(scene, name, table, materials, shared(table, mesh_of), _curve(table, allow_outside))
         if "skin" in table:
             skin = table.table("skin", ["surface", "contact"], ["surface"])

@@ -5,6 +5,7 @@ Lists such as [[bodies.NAME.fix]] hold the calls of a body; tables such as [spri
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 
@@ -51,8 +52,14 @@ CONNECTIONS = {
 
 def body_calls() -> dict[str, Call]:
     """Return the calls of bodies by key, those of all kinds of loads included."""
+    return _calls_with(tuple(LOADS))
+
+
+@cache
+def _calls_with(kinds: tuple[str, ...]) -> dict[str, Call]:
     calls = [Call("fix", "fix"), Call("move", "move"), Call("activate", "activate", varying=("activation",))]
-    for kind, load in LOADS.items():
+    for kind in kinds:
+        load = LOADS[kind]
         of_value, _ = arguments_of(load.of, "body", "what", "where", *load.own)
         calls.insert(-1, Call(kind, "add_load", load.items, tuple(of_value)))
     return {one.key: one for one in calls}
