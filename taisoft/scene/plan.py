@@ -4,6 +4,7 @@ The plan lists which features a scene needs, and why. Disabled features allocate
 features that are enabled may change at run time, in the simulator's own copy of the scene.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 
 from taisoft.attributes import thawed
@@ -21,6 +22,10 @@ from taisoft.scene.scene import Scene
 
 OF_RATES = ("mass_damping", "stiffness_damping", "spring_damping", "rigid_damping", "consistent_mass", "viscosity", "sleeping")
 CHANGEABLE = ("mass_damping", "stiffness_damping", *FIBRE_NUMBERS)  # numbers of a material, besides `Composition.tet_numbers`
+
+
+# feature, the names of what asks for it or whether it is modelled, why, with {} for these names, and why not
+Row = tuple[str, list[str] | bool, str, str]
 
 
 @dataclass
@@ -45,10 +50,6 @@ class Plan:
         """Return the plan of statics, which models nothing that depends on velocities."""
         static = {"on": False, "why": "statics has no velocities"}
         return Plan([one | static if one["feature"] in OF_RATES else one for one in self.entries])
-
-    def add(self, feature: str, on: bool, why: str, why_not: str) -> None:
-        """Add a feature with the reason for its state."""
-        self.entries.append({"feature": feature, "on": bool(on), "why": why if on else why_not})
 
     def add_why(self, feature: str, why: str) -> None:
         """Add to the reason for a feature that is modelled."""
@@ -82,131 +83,123 @@ def make_plan(
 ) -> Plan:
     """Plan the features for a scene, the kind of integrator, self-collision, draggable bodies, and those that may sleep."""
     plan = Plan()
-
-    def add_if_any(feature: str, test, why: str, why_not: str) -> None:
-        names = [b.name for b in scene.bodies if test(b)]
-        plan.add(feature, bool(names), f"{why} {_shorten(names)}", why_not)
-
-    for law in (one for one in LAWS if LAWS[one].is_classic or any(one in b.composition.laws for b in scene.bodies)):
-        add_if_any(f"law:{law}", lambda b, law=law: law in b.composition.laws, "used by", "no body uses it")
-    add_if_any(
-        "elasticity_by_tet",
-        lambda b: b.composition.elastic_by_tet,
-        "young, poisson or a parameter may differ between the tets of",
-        "every body has one young and one poisson",
-    )
-    add_if_any("volume_floor", lambda b: b.composition.has_volume_floor, "material of", "every volume_floor is 0")
-    add_if_any("fibres", lambda b: b.fibres is not None, "material and directions of", "no material has fibres")
-    add_if_any("viscosity", lambda b: b.composition.branches.shape[1], "Maxwell branches of", "no material has branches")
-    reasons = []
-    for given, why in (("auto", f"a poisson of at least {NEARLY_INCOMPRESSIBLE} in linear tets of"), ("mean", "requested for")):
-        if names := [b.name for b in scene.bodies if (b.given_dilatation, b.dilatation) == (given, "mean")]:
-            reasons.append(f"{why} {_shorten(names)}")
-    plan.add("mean_dilatation", bool(reasons), "; ".join(reasons), "every body has local dilatation")
-    quadratic = [b.name for b in scene.bodies if b.order == 2]
-    add_if_any("quadratic_tets", lambda b: b.order == 2, "bodies of order 2:", "every body is of order 1")
-    plan.add(
-        "consistent_weight",
-        quadratic and not explicit,
-        "gravity on quadratic tets acts as int rho N g dV",
-        "explicit steps take gravity as an acceleration" if quadratic else "on linear tets it is the lumped mass",
-    )
-    plan.add(
-        "consistent_mass",
-        quadratic and not explicit,
-        f"quadratic tets of {_shorten(quadratic)} in implicit steps",
-        "explicit steps need a diagonal mass" if quadratic else "the mass of linear tets is lumped",
-    )
-    loaded = [b.name for b in scene.bodies if any(load.feature == DEAD for load in b.loads)]
-    why = f"tractions or forces on {_shorten(loaded)}" if loaded else "bodies can be dragged"
-    plan.add("loads", loaded or draggable, why, "no traction and no force")
-    pressed = [b.name for b in scene.bodies if any(load.feature == FOLLOWER for load in b.loads)]
-    plan.add("pressure", pressed, f"on {_shorten(pressed)}", "no surface is under pressure")
-    varied = [b.name for b in scene.bodies if any(load.path for load in (*b.loads, *b.activations))] + [
-        t.name for t in scene.tendons if t.path
+    rows = [
+        *_of_bodies(scene),
+        *_of_loads(scene, draggable),
+        *_of_steps(scene, explicit, multistep, sleep, scene.pushes(self_collision)),
+        *_of_contacts(scene, self_collision),
     ]
-    varied += [one.name for one in scene.connections if scene.moves(one) and one.name not in varied]
-    plan.add("load_paths", varied, f"on {_shorten(varied)}", "every load is constant")
-    fixes, moves = ((lambda b, m=m: any((c.path is not None) == m for c in scene.constraints(b))) for m in (False, True))
-    add_if_any("fixed_nodes", fixes, "on", "no node is fixed")
-    add_if_any("moving_nodes", moves, "paths on", "no node follows a path")
-    for damping in ("mass_damping", "stiffness_damping"):
-        add_if_any(damping, lambda b, d=damping: getattr(b.composition.first, d) > 0, "material of", f"every {damping} is 0")
-    exact = [one.name for one in scene.dependent_attachments]
-    connected = [one.name for one in scene.connections if one not in scene.exact_attachments]
-    plan.add("springs", connected, _shorten(connected), "no spring, tendon or attachment by springs")
-    embedded = [body.name for body in scene.bodies if body.nodes.embedded is not None]
-    why_not = "no node is attached exactly, and no surface embedded"
-    plan.add("dependent_nodes", exact or embedded, _shorten(exact + embedded), why_not)
-    rigid = [body.name for body in scene.rigid_bodies]
-    plan.add("rigid_bodies", rigid, _shorten(rigid), "every body is elastic")
-    plan.add(
-        "rigid_damping",
-        rigid and not explicit and scene.pushes(self_collision),
-        f"implicit steps damp the strains that impacts leave in {_shorten(rigid)}",
-        "explicit steps store no strain" if rigid and explicit else "no impact strains a rigid body",
-    )
-    why_not = "implicit steps keep rigid bodies rigid by elasticity" if rigid else "every body is elastic"
-    plan.add("rigid_motion", rigid and explicit, f"explicit steps move {_shorten(rigid)} as rigid bodies", why_not)
-    damped = [one.name for one in scene.connections if one.damping > 0.0]
-    plan.add("spring_damping", damped, _shorten(damped), "no spring or attachment is damped")
-    plan.add("assembled_stiffness", not explicit, "implicit steps solve linear systems", "explicit steps need forces only")
-    plan.add("past_states", multistep, "the integrator uses the two previous steps", "a one-step integrator")
-    plan.add(
-        "inversion_handling",
-        not explicit,
-        "directions of negative curvature lead out of inverted tets",
-        "explicit steps need forces only, and every law defines them for inverted tets too",
-    )
-    restless = never_resting(scene)
-    why_not = (
-        "switched off, or steps follow a tolerance"
-        if not sleep
-        else "explicit steps move everything"
-        if explicit
-        else "every body is driven"
-    )
-    plan.add(
-        "sleeping",
-        sleep and not explicit and len(restless) < len(scene.bodies),
-        "implicit steps leave out bodies at rest" + (f", but for {_shorten(restless)}" if restless else ""),
-        why_not,
-    )
-    _add_collision(plan, scene, self_collision)
+    for feature, on, why, why_not in rows:
+        names = _shorten(on) if isinstance(on, list) else ""
+        plan.entries.append({"feature": feature, "on": bool(on), "why": why.replace("{}", names) if on else why_not})
     return plan
 
 
-def _add_collision(plan: Plan, scene: Scene, self_collision: bool) -> None:
-    """Plan contact detection: a body takes part only if another collider has triangles that can hit it."""
+def _of_bodies(scene: Scene) -> Iterator[Row]:
+    """Elasticity: what the tets of bodies are made of."""
+    bodies = scene.bodies
+    for law in (one for one in LAWS if LAWS[one].is_classic or any(one in b.composition.laws for b in bodies)):
+        yield f"law:{law}", [b.name for b in bodies if law in b.composition.laws], "used by {}", "no body uses it"
+    varies = "young, poisson or a parameter may differ between the tets of {}"
+    by_tet = [b.name for b in bodies if b.composition.elastic_by_tet]
+    yield "elasticity_by_tet", by_tet, varies, "every body has one young and one poisson"
+    floors = [b.name for b in bodies if b.composition.has_volume_floor]
+    yield "volume_floor", floors, "material of {}", "every volume_floor is 0"
+    fibres = [b.name for b in bodies if b.fibres is not None]
+    yield "fibres", fibres, "material and directions of {}", "no material has fibres"
+    viscous = [b.name for b in bodies if b.composition.branches.shape[1]]
+    yield "viscosity", viscous, "Maxwell branches of {}", "no material has branches"
+    reasons = []
+    for given, why in (("auto", f"a poisson of at least {NEARLY_INCOMPRESSIBLE} in linear tets of"), ("mean", "requested for")):
+        if names := [b.name for b in bodies if (b.given_dilatation, b.dilatation) == (given, "mean")]:
+            reasons.append(f"{why} {_shorten(names)}")
+    yield "mean_dilatation", bool(reasons), "; ".join(reasons), "every body has local dilatation"
+    for damping in ("mass_damping", "stiffness_damping"):
+        damped = [b.name for b in bodies if getattr(b.composition.first, damping) > 0.0]
+        yield damping, damped, "material of {}", f"every {damping} is 0"
+    quadratic = [b.name for b in bodies if b.order == 2]
+    yield "quadratic_tets", quadratic, "bodies of order 2: {}", "every body is of order 1"
+
+
+def _of_loads(scene: Scene, draggable: bool) -> Iterator[Row]:
+    """What acts on bodies, holds them and connects them."""
+    bodies = scene.bodies
+    loaded = [b.name for b in bodies if any(load.feature == DEAD for load in b.loads)]
+    why = "tractions or forces on {}" if loaded else "bodies can be dragged"
+    yield "loads", loaded or draggable, why, "no traction and no force"
+    pressed = [b.name for b in bodies if any(load.feature == FOLLOWER for load in b.loads)]
+    yield "pressure", pressed, "on {}", "no surface is under pressure"
+    varied = [b.name for b in bodies if any(load.path for load in (*b.loads, *b.activations))]
+    varied += [t.name for t in scene.tendons if t.path]
+    varied += [one.name for one in scene.connections if scene.moves(one) and one.name not in varied]
+    yield "load_paths", varied, "on {}", "every load is constant"
+    constraints = {b.name: scene.constraints(b) for b in bodies}
+    fixed = [name for name, own in constraints.items() if any(c.path is None for c in own)]
+    yield "fixed_nodes", fixed, "on {}", "no node is fixed"
+    moved = [name for name, own in constraints.items() if any(c.path is not None for c in own)]
+    yield "moving_nodes", moved, "paths on {}", "no node follows a path"
+    connected = [one.name for one in scene.connections if one not in scene.exact_attachments]
+    yield "springs", connected, "{}", "no spring, tendon or attachment by springs"
+    dependent = [one.name for one in scene.dependent_attachments]
+    dependent += [b.name for b in bodies if b.nodes.embedded is not None]
+    yield "dependent_nodes", dependent, "{}", "no node is attached exactly, and no surface embedded"
+    damped = [one.name for one in scene.connections if one.damping > 0.0]
+    yield "spring_damping", damped, "{}", "no spring or attachment is damped"
+    yield "rigid_bodies", [body.name for body in scene.rigid_bodies], "{}", "every body is elastic"
+
+
+def _of_steps(scene: Scene, explicit: bool, multistep: bool, sleep: bool, pushes: bool) -> Iterator[Row]:
+    """What the kind of steps asks for, or leaves out. pushes: whether there can be contact forces."""
+    quadratic = [b.name for b in scene.bodies if b.order == 2]
+    why_not = "explicit steps take gravity as an acceleration" if quadratic else "on linear tets it is the lumped mass"
+    yield "consistent_weight", quadratic and not explicit, "gravity on quadratic tets acts as int rho N g dV", why_not
+    why = f"quadratic tets of {_shorten(quadratic)} in implicit steps"
+    why_not = "explicit steps need a diagonal mass" if quadratic else "the mass of linear tets is lumped"
+    yield "consistent_mass", quadratic and not explicit, why, why_not
+    rigid = [body.name for body in scene.rigid_bodies]
+    why = f"implicit steps damp the strains that impacts leave in {_shorten(rigid)}"
+    why_not = "explicit steps store no strain" if rigid and explicit else "no impact strains a rigid body"
+    yield "rigid_damping", rigid and not explicit and pushes, why, why_not
+    why_not = "implicit steps keep rigid bodies rigid by elasticity" if rigid else "every body is elastic"
+    yield "rigid_motion", rigid and explicit, f"explicit steps move {_shorten(rigid)} as rigid bodies", why_not
+    yield "assembled_stiffness", not explicit, "implicit steps solve linear systems", "explicit steps need forces only"
+    yield "past_states", multistep, "the integrator uses the two previous steps", "a one-step integrator"
+    why = "directions of negative curvature lead out of inverted tets"
+    why_not = "explicit steps need forces only, and every law defines them for inverted tets too"
+    yield "inversion_handling", not explicit, why, why_not
+    restless = never_resting(scene)
+    why = "implicit steps leave out bodies at rest" + (f", but for {_shorten(restless)}" if restless else "")
+    off = "switched off, or steps follow a tolerance"
+    why_not = off if not sleep else "explicit steps move everything" if explicit else "every body is driven"
+    yield "sleeping", sleep and not explicit and len(restless) < len(scene.bodies), why, why_not
+
+
+def _of_contacts(scene: Scene, self_collision: bool) -> Iterator[Row]:
+    """Contact detection: a body takes part only if another collider has triangles that can hit it."""
     obstacles = scene.obstacles
-    plan.add("obstacles", bool(obstacles), _shorten([o.name for o in obstacles]), "the scene has none")
-    with_triangles = len(scene.bodies) + sum(o.shape.surface() is not None for o in obstacles)
-    hit = scene.bodies if with_triangles > 1 else []
+    yield "obstacles", [one.name for one in obstacles], "{}", "the scene has none"
+    with_triangles = len(scene.bodies) + sum(one.shape.surface() is not None for one in obstacles)
+    hit = scene.bodies if with_triangles > 1 else ()
     modes: dict[str, list[str]] = {"distance_field": [], "proximity": []}
     for body in hit:
         modes[body.contact_mode].append(body.name if body.collision == "auto" else f"{body.name} (requested)")
-    modes["proximity"] += [f"{o.name} (triangles)" for o in obstacles if isinstance(o.shape, MeshObstacle) and scene.bodies]
-    modes["proximity"] += [f"{o.name} (edges)" for o in obstacles if isinstance(o.shape, Box) and scene.bodies]
-    fields = [b for b in hit if b.contact_mode == "distance_field"]
-    modes["proximity"] += [f"{b.name} (sharp edges)" for b in fields if has_sharp_edges(b.nodes)]
-    if self_collision:
-        modes["proximity"].append("every body (itself)")
+    by_field, near = modes["distance_field"], modes["proximity"]
+    near += [f"{one.name} (triangles)" for one in obstacles if isinstance(one.shape, MeshObstacle) and scene.bodies]
+    near += [f"{one.name} (edges)" for one in obstacles if isinstance(one.shape, Box) and scene.bodies]
+    near += [f"{b.name} (sharp edges)" for b in hit if b.contact_mode == "distance_field" and has_sharp_edges(b.nodes)]
+    near += ["every body (itself)"] * self_collision
     idle = "no triangles can hit a body" if not hit else "every body is hit by "
-    fields, near = modes["distance_field"], modes["proximity"]
-    plan.add("distance_fields", bool(fields), "hits " + ", ".join(fields), idle + ("proximity" if hit else ""))
-    plan.add("proximity", bool(near), "hits " + ", ".join(near), idle + ("its distance field" if hit else ""))
+    yield "distance_fields", bool(by_field), "hits " + ", ".join(by_field), idle + ("proximity" if hit else "")
+    yield "proximity", bool(near), "hits " + ", ".join(near), idle + ("its distance field" if hit else "")
     meshes = [b.name for b in (scene.bodies if self_collision else hit) if b.contact_mode == "proximity"]
-    n_meshes = len(meshes) + sum(isinstance(o.shape, MeshObstacle) for o in obstacles)
+    n_meshes = len(meshes) + sum(isinstance(one.shape, MeshObstacle) for one in obstacles)
     meet = bool(meshes) and (self_collision or n_meshes > 1)
-    plan.add("mortar", meet, f"mean gaps of {_shorten(meshes)} to meshes", "no two meshes hit by proximity can touch")
-    plan.add("self_collision", self_collision, "requested", "not requested")
-    several = len(scene.colliders) > 1
-    plan.add(
-        "contact_forces",
-        scene.pushes(self_collision),
-        f"{_shorten([c.name for c in scene.colliders])} can touch" if several else "it can touch itself",
-        "one body, and nothing that it could touch" if scene.contact_forces else "the scene's contact_forces are off",
-    )
+    yield "mortar", meet, f"mean gaps of {_shorten(meshes)} to meshes", "no two meshes hit by proximity can touch"
+    yield "self_collision", self_collision, "requested", "not requested"
+    colliders = [one.name for one in scene.colliders]
+    why = f"{_shorten(colliders)} can touch" if len(colliders) > 1 else "it can touch itself"
+    why_not = "one body, and nothing that it could touch" if scene.contact_forces else "the scene's contact_forces are off"
+    yield "contact_forces", scene.pushes(self_collision), why, why_not
 
 
 def change_material(body: Body, numbers: dict, on: dict[str, bool], region: int | str | None = None) -> None:
