@@ -107,6 +107,7 @@ class Body(Guarded):
         **dict.fromkeys(("activate", "activations"), "call sim.set_activation(body, value)"),
         "position": "call sim.set_state(positions=..., body=...)",
         "velocity": "call sim.set_state(velocities=..., body=...)",
+        **dict.fromkeys(("add_load", "loads"), f"call sim.set_load(body, kind, index, value), or {USE_A_COPY}"),
         **{f"add_{kind}": rule for kind, rule in _SET.items()},
         **{loads: _SET[kind] for loads, kind in BY_KIND.items()},
     }
