@@ -5,36 +5,28 @@ depth, the least distance of states that do not cross, sums over its steps, and 
 """
 
 import time
-import warnings
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 
 import numpy as np
 
 from taisoft import Simulator
 from taisoft.cli.scene_file import load_module, shipped_files
 from taisoft.errors import TaisoftError
-from taisoft.machine import machine, usable_cores
-from taisoft.many.places import LocalPlace, carry_out
-from taisoft.many.store import Store, code_digest, digest
 from taisoft.records import RunReport, StepReport
 from taisoft.scene.scene import Scene
 
 from . import crossing_shots
 from .crossing_heaps import folded_strip, make_heap
-from .hard_cases import CASES
+from .hard_cases import VARIANTS
 from .hard_cases.case import REFUSED, Session
-from .hard_runs import find
-from .runner import files_digest
+from .runner import without_warnings
 
-CHILD = ("-m", "taisoft", "bench", "crossings", "--child")
 DEMOS, HARD, HEAPS, SHOTS, JITTERED = GROUPS = ("demos", "hard", "heaps", "shots", "jittered")
 N_HEAPS, N_STARTS = 200, 10
 JITTER = 1e-4  # [m], largest displacement along each axis of a jittered start
 FOLD = "fold"
 FOLD_SETTINGS, FOLD_STEPS = {"dt": 1 / 60, "integrator": "implicit_euler", "self_collision": True}, 150
-TWISTED, SQUEEZED = ("S1", "B, start 0"), ("S4", ("corotational", "stable_neo_hookean"))
+TWISTED, SQUEEZED = "S1", ("S4 corotational", "S4 stable_neo_hookean")  # jittered hard cases
 DISTANCE_EVERY = 10  # judged states
 NEAR = 1e-3  # [m], up to which least distances are measured
 
@@ -164,27 +156,25 @@ def jitter_start(sim: Simulator, number: int) -> None:
     sim.set_state(x + free[:, None] * np.random.default_rng(number).uniform(-JITTER, JITTER, x.shape))
 
 
-def runs_of(group: str, count: int | None = None) -> list[str]:
+def names_of(group: str, count: int | None = None) -> list[str]:
     """The names of a group's runs; count: of heaps, of shots of each kind, or of starts of each jittered scene."""
     if group == DEMOS:
         return list(shipped_files("demos"))
     if group == HARD:
-        return [f"{case.id}: {variant.name}" for case in CASES for variant in case.variants if variant.must.end != REFUSED]
+        return [name for name, (_, variant) in VARIANTS.items() if variant.must.end != REFUSED]
     if group == HEAPS:
         return [f"heap {k:03d}" for k in range(N_HEAPS if count is None else count)]
     if group == SHOTS:
         return crossing_shots.names(crossing_shots.N_SHOTS if count is None else count)
     starts = range(N_STARTS if count is None else min(count, N_STARTS))
-    scenes = [FOLD, TWISTED[0], *(f"{SQUEEZED[0]} {law}" for law in SQUEEZED[1])]
-    return [f"{scene}, start {k}" for scene in scenes for k in starts]
+    return [f"{scene}, start {k}" for scene in (FOLD, TWISTED, *SQUEEZED) for k in starts]
 
 
 def run(group: str, name: str, arch: str, steps: int | None = None) -> dict:
     """Run and judge in this process; returns the record. steps: at most, of heaps, shots and folds."""
     clock, watch = time.perf_counter(), Watch()
     ended = {"status": REFUSED, "problems": [], "settings": "", "kinds": []}
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)
+    with without_warnings():
         try:
             by = {DEMOS: _demo, HARD: _hard, HEAPS: _heap, SHOTS: _shot, JITTERED: _jittered}[group]
             ended |= by(name, arch, watch, steps)
@@ -234,7 +224,7 @@ def _session(session: Session) -> dict:
 
 
 def _hard(name: str, arch: str, watch: Watch, _: int | None) -> dict:
-    return _session(JudgedSession(*find(*name.split(": ", 1)), arch, watch))
+    return _session(JudgedSession(*VARIANTS[name], arch, watch))
 
 
 def _jittered(name: str, arch: str, watch: Watch, steps: int | None) -> dict:
@@ -243,54 +233,13 @@ def _jittered(name: str, arch: str, watch: Watch, steps: int | None) -> dict:
         with JudgedSimulator(folded_strip(), watch=watch, arch=arch, **FOLD_SETTINGS) as sim:
             jitter_start(sim, int(number))
             return _ended(sim.run(min(FOLD_STEPS, steps or FOLD_STEPS) * sim.dt, fps=None), FOLD_SETTINGS)
-    if scene == TWISTED[0]:  # whose own starts are random
-        case, variant = find(*TWISTED)
+    if scene == TWISTED:  # whose own starts are random
+        case, variant = VARIANTS[f"{TWISTED}: B, start 0"]
         variant = replace(variant, parameters=variant.parameters | {"seed": int(number)})
         return _session(JudgedSession(case, variant, arch, watch))
-    return _session(JudgedSession(*find(*scene.split(" ")), arch, watch, int(number)))
+    return _session(JudgedSession(*VARIANTS[scene.replace(" ", ": ")], arch, watch, int(number)))
 
 
 def answer(request: dict) -> dict:
-    """In a child: answer a request with its record."""
-    return {"answer": run(request["group"], request["name"], request["arch"], request["steps"])}
-
-
-def sources() -> str:
-    """A digest of the files that define the runs."""
-    here = Path(__file__).parent
-    paths = [*here.glob("crossing*.py"), *here.glob("judge.py"), *here.glob("hard_cases/*.py"), *shipped_files("demos").values()]
-    return files_digest(paths)
-
-
-def carry_out_all(
-    requests: list[dict],
-    store: Store,
-    *,
-    seconds_left: Callable[[], float],
-    stop_requested: Callable[[], bool],
-    say: Callable[[str], None],
-) -> list[dict]:
-    """The records of requests in order, or {"group", "name", "left_out": reason} for one without. Raises OutputError."""
-    on = [machine() | {"load": None}, code_digest(), sources()]
-    keys = [digest([request, on])[:32] for request in requests]
-    found = {key: kept for key in keys if (kept := store.read(key)) is not None}
-    left = {key: request for key, request in zip(keys, requests) if key not in found}
-
-    def done(key: str, result: dict) -> None:
-        name, number = left[key]["name"], f"{len(found) + 1} of {len(keys)}"
-        if "answer" not in result:
-            found[key] = {"left_out": result.get("error") or result["crash"], "crashed": True}
-            say(f"{number}: {name}: {found[key]['left_out']}")
-            return
-        one = found[key] = store.write(key, result["answer"])
-        first = f" from step {one['first']['step']} on" if one["first"] else ""
-        first += "" if one["tunnelled"] is None else f", tunnelled in step {one['tunnelled']}"
-        say(
-            f"{number}: {name}: {one['crossing']} of {one['states']} states cross{first}, {one['status']}, {one['seconds']:.0f} s"
-        )
-
-    why = carry_out(
-        left.items(), [LocalPlace(usable_cores(), CHILD)], done, seconds_left=seconds_left, stop_requested=stop_requested
-    )
-    found |= {key: {"left_out": reason, "crashed": False} for key, reason in why.items()}
-    return [{"group": r["group"], "name": r["name"]} | found[key] for key, r in zip(keys, requests)]
+    """In a child: the record of a run."""
+    return run(request["group"], request["name"], request["arch"], request["steps"])

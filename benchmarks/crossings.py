@@ -1,6 +1,7 @@
 """Crossings: does any surface cross another one, or itself, after any step?
 
-taisoft bench crossings [--what GROUP ...] [--only NAME] [--count N] [--budget SECONDS] [--quick] [--keep DIR] [--out [FILE.json]]
+taisoft bench crossings [--what GROUP ...] [--only NAME ...] [--count N] [--quick] [--arch cpu|cuda] [--budget SECONDS]
+                        [--keep DIR] [--out [FILE.json]]
 
 ipctk judges every state: after each step of an implicit integrator, after each sub-step of an explicit one. Judged are bodies
 against each other and against obstacles, and against themselves where self-collision is on.
@@ -22,24 +23,16 @@ crashes, else 0.
 
 import argparse
 import sys
-import time
 from collections.abc import Iterable
-from contextlib import ExitStack, closing
 from functools import partial
-from pathlib import Path
 
-from taisoft.cli import Signals
-from taisoft.errors import OutputError
-from taisoft.machine import load_average
-from taisoft.many.places import serve
-from taisoft.many.store import Store
-from taisoft.output.files import FolderLock, make_folder
+from taisoft.machine import require
 
-from .crossing_runs import DEMOS, DISTANCE_EVERY, GROUPS, HARD, HEAPS, JITTERED, NEAR, SHOTS, answer, carry_out_all, runs_of
-from .document import Document, header, table
-from .runner import add_arch, add_named_out, make_parser, named_out, progress
+from .crossing_runs import DEMOS, DISTANCE_EVERY, GROUPS, HARD, HEAPS, JITTERED, NEAR, SHOTS, answer, names_of
+from .document import begin, table
+from .runner import named_out
+from .suite import CRASHED, LEFT_OUT, chosen, runs_of, suite_options, suite_parser
 
-DAY = 86_400.0  # [s]
 TITLE = "Crossings"
 QUICK = {
     DEMOS: ("cube_on_box", "sheet_on_box"),
@@ -49,24 +42,24 @@ QUICK = {
     JITTERED: ("fold, start 0",),
 }
 QUICK_STEPS = 20
+FILES = ("crossing*.py", "judge.py", "hard_cases/*.py", "../demos/*.py")  # that define the runs
 SECONDS = ("seconds", "judge_seconds")
 TOTALS = {"Newton": "newton_iterations", "CG": "linear_iterations", "substeps": "substeps"}  # by heading
 MOST_PAIRS = 4  # of names in a sentence
 
 
-def chosen(what: Iterable[str], only: str, count: int | None, quick: bool, arch: str) -> list[dict]:
-    """The requests of the groups' runs whose names contain `only`."""
-    return [
-        {"group": group, "name": name, "arch": arch, "steps": QUICK_STEPS if quick else None}
-        for group in what
-        for name in (QUICK[group] if quick else runs_of(group, count))
-        if only in name
-    ]
+def asked(options: argparse.Namespace) -> dict[str, dict]:
+    """The requests of the groups' runs by name."""
+    return {
+        name: {"group": group, "name": name, "arch": options.arch, "steps": QUICK_STEPS if options.quick else None}
+        for group in options.what
+        for name in (QUICK[group] if options.quick else names_of(group, options.count))
+    }
 
 
 def ran(rows: Iterable[dict]) -> list[dict]:
     """The rows with a record."""
-    return [row for row in rows if "left_out" not in row]
+    return [row for row in rows if LEFT_OUT not in row]
 
 
 def least_text(row: dict) -> str:
@@ -121,7 +114,7 @@ def group_text(group: str, rows: list[dict]) -> str:
     ]
     notes += [f"{row['name']}: {row['starts_crossing']} starts cross before any step." for row in found if row["starts_crossing"]]
     notes += [f"{row['name']}: {problem}" for row in found for problem in row["problems"]]
-    notes += [f"{row['name']} was not run: {row['left_out']}" for row in rows if "left_out" in row]
+    notes += [f"{row['name']} was not run: {row[LEFT_OUT]}" for row in rows if LEFT_OUT in row]
     made = table(found, COLUMNS, notes) if found else "\n".join(f"* {note}" for note in notes)
     return f"## {group}\n\n{made}\n\n{total_text(group, rows)}"
 
@@ -144,52 +137,37 @@ def page(rows: list[dict]) -> list[str]:
 
 def failed(rows: list[dict]) -> bool:
     """Whether a state crosses, a shot has tunnelled or a run crashed."""
-    return any(row.get(key) for row in rows for key in ("crossing", "starts_crossing", "tunnelled", "crashed"))
+    return any(row.get(key) for row in rows for key in ("crossing", "starts_crossing", "tunnelled", CRASHED))
+
+
+def said(request: dict, row: dict) -> str:
+    """How a run ended, in a line."""
+    if LEFT_OUT in row:
+        return f"{request['name']}: {row[LEFT_OUT]}"
+    first = f" from step {row['first']['step']} on" if row["first"] else ""
+    first += "" if row["tunnelled"] is None else f", tunnelled in step {row['tunnelled']}"
+    cross = f"{row['crossing']} of {row['states']} states cross{first}"
+    return f"{request['name']}: {cross}, {row['status']}, {row['seconds']:.0f} s"
 
 
 def main(argv=None) -> int:
     """Run, judge and print. Raises OutputError."""
-    parser = make_parser("crossings", __doc__)
+    parser = suite_parser("crossings", __doc__, "a few runs, heaps and folds of 20 steps")
     parser.add_argument("--what", nargs="+", choices=GROUPS, default=list(GROUPS), help="only these groups")
-    parser.add_argument("--only", default="", metavar="NAME", help="only runs whose name contains this, such as 'heap 017'")
     parser.add_argument(
         "--count", type=int, metavar="N", help="only the first N heaps, N shots of each kind, N starts of each jittered scene"
     )
-    parser.add_argument("--budget", type=float, default=DAY, metavar="SECONDS", help="start no run after this time")
-    parser.add_argument("--quick", action="store_true", help="a few runs, heaps and folds of 20 steps")
-    add_arch(parser)
-    parser.add_argument("--keep", type=Path, metavar="DIR", help="store finished runs there, and reuse those stored")
-    add_named_out(parser)
-    parser.add_argument("--child", action="store_true", help=argparse.SUPPRESS)  # how this command carries out one run
-    options = parser.parse_args(argv)
-    if options.child:
-        serve(answer)
-    try:
-        import ipctk  # noqa: F401
-    except ImportError:
-        raise OutputError("taisoft bench crossings needs ipctk, which judges: pip install ipctk") from None
-    requests = chosen(options.what, options.only, options.count, options.quick, options.arch)
-    if not requests:
-        parser.error(f"--only {options.only!r}: no run of {', '.join(options.what)} is called so")
-    out, document = named_out(options, "crossings"), Document()
-    text, numbers = header(TITLE, f"arch {options.arch}", packages=("taichi", "numpy", "ipctk"))
-    document.add(text)
-    end = time.monotonic() + options.budget
-    with Signals("ending; runs that are finished are kept") as signals, ExitStack() as stack:
-        store = Store()
-        if options.keep is not None:
-            folder = make_folder(options.keep)
-            stack.enter_context(closing(FolderLock(folder)))
-            store = Store(folder)
-        signals.run_began()
-        limits = {"seconds_left": lambda: end - time.monotonic(), "stop_requested": signals.requested}
-        rows = carry_out_all(requests, store, **limits, say=progress)
-    for part in (*page(rows), *store.damaged):
+    options = suite_options(parser, argv, answer)
+    require("ipctk", "taisoft bench crossings", "dev")
+    requests = chosen(parser, options.only, asked(options))
+    options.out = named_out(options, "crossings")
+    document, numbers = begin(TITLE, f"arch {options.arch}", packages=("taichi", "numpy", "ipctk"))
+    with runs_of("crossings", options, *FILES) as runs:
+        rows = [{"group": one["group"], "name": one["name"]} | row for one, row in zip(requests, runs.records(requests, said))]
+    for part in (*page(rows), *runs.store.damaged):
         document.add(part)
-    if out is not None:
-        options = {key: getattr(options, key) for key in ("arch", "quick", "what", "only", "count")}
-        document.write(out, numbers | options | {"load_at_the_end": load_average(), "rows": rows})
-    return 1 if failed(rows) else 0
+    selected = {key: getattr(options, key) for key in ("what", "only", "count")}
+    return document.finish(options, numbers | selected | {"rows": rows}) or int(failed(rows))
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """Estimated against true errors: twelve scenes of smooth motion, impacts and friction, and contact forces with references.
 
-taisoft bench error [--scene NAME ... | --forces] [--quick] [--out [FILE.json]]
+taisoft bench error [--only NAME ...] [--quick] [--budget SECONDS] [--keep DIR] [--out [FILE.json]]
 
 Each scene runs once with error=True and error_mesh="refined" (`taisoft.estimation`), in single precision. True errors are
 distances to other runs at the frames, over the largest excursion: in time to one with a sixteenth of the step in double
@@ -8,14 +8,12 @@ precision; of the solvers to one with the same step, tolerances of 1e-9 and 1e-8
 space, at the nodes of the first mesh, to one on the mesh refined twice with the steps of the first, or of its twin if they are
 explicit. An excursion is the largest distance of a node from its start. Ratio: estimate over truth. Twins: their wall time over
 the run's, without that on the refined mesh. Forces: see `error_quantities`. Exit status: 0, or 1 if too many ratios are outside
-their limits.
+their limits or a case could not be measured. --only force: contact forces alone.
 """
 
-import argparse
 import math
 import sys
-import time
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 
 import numpy as np
 
@@ -24,12 +22,12 @@ from taisoft.display import percent
 from taisoft.estimation.comparison import distance, largest_excursion, shared_nodes
 from taisoft.records import ERROR_KINDS
 from taisoft.scene.refine import refined
-from taisoft.scene.scene import Scene
 
 from .document import Limit, begin, table
-from .error_cases import CASES, CONTACT, SMOOTH, Case
-from .error_quantities import force_limits, force_rows, force_table
-from .runner import add_named_out, make_parser, named_out, progress, without_warnings
+from .error_cases import CASES, CONTACT, SMOOTH, Case, estimate_columns, path_of
+from .error_quantities import FORCES, Force, ForceRow, force_limits, force_row, force_table
+from .runner import named_out, without_warnings
+from .suite import LEFT_OUT, chosen, runs_of, suite_options, suite_parser
 
 STEPS_A_FRAME = 4  # of implicit runs: twins with four times the step then meet every frame
 EXPLICIT_FPS = 1000.0  # frames per second of explicit runs [1/s]
@@ -40,6 +38,7 @@ SPACE = (0.3, 5.0)
 LEAST = 0.2  # of every estimate over truth
 ENOUGH = 10 / 12  # fraction of the scenes within the ranges
 QUICK = ("hanging beam", "incline")
+EVERY: dict[str, Case | Force] = {case.name: case for case in CASES} | {str(force): force for force in FORCES}
 
 
 @dataclass
@@ -62,14 +61,6 @@ class Row:
         """Estimate over truth; nan if either is unknown or zero."""
         estimate, truth = self.estimated[what], self.true[what]
         return estimate / truth if estimate is not None and truth > 0.0 else math.nan
-
-
-def path_of(case: Case, scene: Scene, dt: float, **settings) -> tuple[np.ndarray, list]:
-    """Positions (k,n,3) [m] at the frames, and name and number of nodes of each body."""
-    path = []
-    with ts.Simulator(scene, dt=dt, integrator=case.integrator, **settings) as sim:
-        sim.run(case.seconds, on_frame=lambda sim, *_: path.append(sim.positions()), fps=fps_of(case))
-        return np.array(path), [[b.name, b.n_nodes] for b in sim.scene.bodies]
 
 
 def fps_of(case: Case) -> float:
@@ -124,9 +115,10 @@ def true_errors(case: Case, dt: float, path: np.ndarray, bodies: list) -> dict[s
     exact = {} if explicit else {"newton_tolerance": EXACT["newton_tolerance"]}
     if case.kind == CONTACT:
         exact["contact_tolerance"] = EXACT["contact_tolerance"]
-    truth, _ = path_of(case, case.build(), dt / TRUTH, precision="f64", **exact)
-    solved, _ = path_of(case, case.build(), dt, precision="f64", **exact)
-    fine, fine_bodies = path_of(case, refined(refined(case.build())), dt / 4 if explicit else dt)
+    run = {"integrator": case.integrator, "seconds": case.seconds, "fps": fps_of(case)}
+    truth, _ = path_of(case.build(), dt / TRUTH, precision="f64", **run, **exact)
+    solved, _ = path_of(case.build(), dt, precision="f64", **run, **exact)
+    fine, fine_bodies = path_of(refined(refined(case.build())), dt / 4 if explicit else dt, **run)
     excursion = largest_excursion(truth)
     own, theirs = shared_nodes(path[0], bodies, fine[0], fine_bodies)
     k = min(len(one) for one in (path, truth, solved, fine))  # a failed run is shorter
@@ -140,22 +132,15 @@ def true_errors(case: Case, dt: float, path: np.ndarray, bodies: list) -> dict[s
 def row_table(rows: list[Row]) -> str:
     """A row per scene: estimate, truth and ratio of each kind of error."""
 
-    def cells(what: str) -> list[tuple]:
-        return [
-            (f"{what} [%]", lambda r: percent(r.estimated[what]) if r.estimated[what] is not None else "unknown"),
-            ("true", lambda r: percent(r.true[what])),
-            ("ratio", lambda r: "-" if math.isnan(r.ratio(what)) else f"{r.ratio(what):.2f}"),
-        ]
-
     columns = (
         ("<scene", lambda r: r.name),
         ("<integrator", lambda r: r.integrator),
         ("tets", lambda r: f"{r.tets:,}"),
         ("steps", lambda r: f"{r.steps:,}"),
-        *cells("time"),
+        *estimate_columns("time", "%", percent),
         ("order", lambda r: "-" if r.order is None else f"{r.order:.2f}"),
-        *cells("space"),
-        *cells("solver"),
+        *estimate_columns("space", "%", percent),
+        *estimate_columns("solver", "%", percent),
         ("twins / run", lambda r: f"{r.twins:.2g}"),
     )
     return table(rows, columns, [f"{row.name}: {note}" for row in rows for note in row.notes])
@@ -178,37 +163,35 @@ def find_limits(rows: list[Row]) -> list[Limit]:
     return [*found, Limit("smallest estimate over truth, time and space", min(ratios, default=math.nan), LEAST, at_least=True)]
 
 
-def parser() -> argparse.ArgumentParser:
-    """The options."""
-    made = make_parser("error", __doc__)
-    names = [case.name for case in CASES]
-    made.add_argument("--scene", nargs="+", choices=names, metavar="NAME", help=f"only these: {', '.join(names)}")
-    made.add_argument("--quick", action="store_true", help=f"only {' and '.join(QUICK)}")
-    made.add_argument("--forces", action="store_true", help="only contact forces; without --scene and --quick they follow")
-    add_named_out(made)
-    return made
+def answer(request: dict) -> dict:
+    """In a child: the row of a scene or a force."""
+    case = EVERY[request["name"]]
+    with without_warnings():
+        return asdict(measured(case) if isinstance(case, Case) else force_row(case))
+
+
+def said(request: dict, row: dict) -> str:
+    """How a case ended, in a line."""
+    return f"{request['name']}: {row.get(LEFT_OUT, 'measured')}"
 
 
 def main(argv: list[str] | None = None) -> int:
     """Measure and print. Raises OutputError if a file cannot be written."""
-    options = parser().parse_args(argv)
-    options.arch = "cpu"
+    parser = suite_parser("error", __doc__, f"only {' and '.join(QUICK)}", arch=False)
+    options = suite_options(parser, argv, answer)
+    requests = chosen(parser, options.only, {name: {"name": name} for name in (QUICK if options.quick else EVERY)})
     options.out = named_out(options, "error")
-    document, numbers = begin("Estimated against true errors", "cpu", "f32")
-    names = [] if options.forces else options.scene or (QUICK if options.quick else [case.name for case in CASES])
-    rows, forces, start = [], [], time.perf_counter()
-    for case in CASES:
-        if case.name in names:
-            progress(f"{case.name}, {time.perf_counter() - start:.0f} s")
-            with without_warnings():
-                rows.append(measured(case))
+    document, numbers = begin("Estimated against true errors", options.arch, "f32")
+    with runs_of("error", options, "error*.py", "reference_cases/record.py", "reference_cases/pressing.py") as runs:
+        found = [one for one in runs.records(requests, said) if LEFT_OUT not in one]
+    rows = [Row(**one) for one in found if "quantity" not in one]
+    forces = [ForceRow(**one) for one in found if "quantity" in one]
     if rows:
         document.add(row_table(rows))
-    if options.forces or not (options.scene or options.quick):
-        forces = list(force_rows())
+    if forces:
         document.add(f"## Contact forces, f64\n\n{force_table(forces)}")
     limits = [*(find_limits(rows) if rows else ()), *(force_limits(forces) if forces else ())]
-    return document.finish(options, numbers | {"precision": "f32", "rows": rows, "forces": forces}, limits)
+    return runs.finish(document, options, numbers | {"precision": "f32", "rows": rows, "forces": forces}, limits)
 
 
 if __name__ == "__main__":

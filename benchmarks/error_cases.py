@@ -1,5 +1,6 @@
 """The scenes of `taisoft bench error`: smooth motion, impacts and friction, in both element orders and all kinds of steps."""
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
@@ -12,6 +13,27 @@ from .reference_cases.record import face
 SMOOTH, CONTACT = "smooth", "contact"  # kinds of motion, in time
 COMMON = {"poisson": 0.3, "density": 1000.0}
 G = 9.81  # m/s^2
+
+
+def path_of(scene: ts.Scene, dt: float, integrator: str, seconds: float, fps: float, **settings) -> tuple[np.ndarray, list]:
+    """Positions (k,n,3) [m] at the frames of a run, and name and number of nodes of each body."""
+    path = []
+    with ts.Simulator(scene, dt=dt, integrator=integrator, **settings) as sim:
+        sim.run(seconds, on_frame=lambda sim, *_: path.append(sim.positions()), fps=fps)
+        return np.array(path), [[b.name, b.n_nodes] for b in sim.scene.bodies]
+
+
+def estimate_columns(kind: str, unit: str, text: Callable[[float], str]) -> list[tuple]:
+    """Columns of a table: estimate, truth and ratio of a kind of error, of rows with `estimated`, `true` and `ratio`."""
+
+    def known(value: float | None) -> str:
+        return text(value) if value is not None and math.isfinite(value) else "unknown"
+
+    return [
+        (f"{kind} [{unit}]", lambda row: known(row.estimated[kind])),
+        ("true", lambda row: known(row.true[kind])),
+        ("ratio", lambda row: f"{row.ratio(kind):.2f}" if math.isfinite(row.ratio(kind)) else "-"),
+    ]
 
 
 @dataclass(frozen=True)

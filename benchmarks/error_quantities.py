@@ -7,7 +7,7 @@ the run with TRUTH times the steps on the same mesh; of the solvers, to one with
 """
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -17,8 +17,8 @@ from taisoft.mesh.quality import mean_surface_edge
 from taisoft.records import ERROR_KINDS, Quantity
 
 from .document import Limit, table
+from .error_cases import estimate_columns
 from .reference_cases.pressing import quarter_ball, quarter_block
-from .runner import progress, without_warnings
 
 TRUTH = 16  # steps of the truth over those of the run
 EXACT = {"newton_tolerance": 1e-9, "contact_tolerance": 1e-8}
@@ -39,6 +39,9 @@ class Force:
     cells: tuple[int, int]
     quantity: str
     truth: float
+
+    def __str__(self) -> str:
+        return f"force: {self.name}, {self.cells[0]} cells, {self.quantity}"
 
 
 @dataclass
@@ -169,23 +172,8 @@ def force_row(case: Force) -> ForceRow:
     return ForceRow(case.name, case.cells, case.quantity.split()[0], one.value, estimates, true, one.notes)
 
 
-def force_rows() -> Iterator[ForceRow]:
-    """The rows of all cases."""
-    for case in FORCES:
-        progress(f"{case.name}, {case.cells[0]} cells, {case.quantity}")
-        with without_warnings():
-            yield force_row(case)
-
-
 def force_table(rows: list[ForceRow]) -> str:
     """A row per force: its value, and estimate, truth and ratio of each kind of error."""
-
-    def cells(kind: str) -> list[tuple]:
-        return [
-            (f"{kind} [N]", lambda r: "unknown" if r.estimated[kind] is None else f"{r.estimated[kind]:.2g}"),
-            ("true", lambda r: f"{r.true[kind]:.2g}" if math.isfinite(r.true[kind]) else "unknown"),
-            ("ratio", lambda r: f"{r.ratio(kind):.2f}" if math.isfinite(r.ratio(kind)) else "-"),
-        ]
 
     columns = (
         ("<scene", lambda r: r.name),
@@ -193,7 +181,7 @@ def force_table(rows: list[ForceRow]) -> str:
         ("of the twin", lambda r: str(r.cells[1])),
         ("<quantity", lambda r: r.quantity),
         ("value [N]", lambda r: f"{r.value:.5g}"),
-        *(column for kind in ERROR_KINDS for column in cells(kind)),
+        *(column for kind in ERROR_KINDS for column in estimate_columns(kind, "N", "{:.2g}".format)),
     )
     return table(rows, columns, [f"{row.name}, {row.cells[0]} cells: {note}" for row in rows for note in row.notes])
 

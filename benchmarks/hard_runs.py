@@ -4,21 +4,15 @@ A variant is solved if it ended as required and met every limit. It is in one co
 an ok end that is not allowed or that misses a limit on the answer.
 """
 
-from collections.abc import Callable
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
-from pathlib import Path
 
 import numpy as np
 
-from taisoft.machine import machine, usable_cores
-from taisoft.many.places import LocalPlace, carry_out
-from taisoft.many.store import Store, code_digest, digest
-
-from .hard_cases import CASES
+from .hard_cases import VARIANTS
 from .hard_cases.case import DEGRADED, END, FINER, OK, REFUSED, STOPPED, Case, Session, Variant, Verdict, judge
-from .runner import files_digest
+from .suite import LEFT_OUT, Runs
 
-CHILD = ("-m", "taisoft", "bench", "hard", "--child")
 ANSWERED = (OK, DEGRADED)  # ends of complete runs
 CHEAP_SECONDS = 60.0  # estimated time up to which references run by default
 WRONG, NOT_RUN = "wrong", "not run"
@@ -41,6 +35,11 @@ class Row:
     reference_left_out: str = ""
     error: float | None = None
     verdicts: list[Verdict] = field(default_factory=list)
+
+    @property
+    def name(self) -> str:
+        """Its name in VARIANTS."""
+        return f"{self.case.id}: {self.variant.name}"
 
     def judge(self) -> None:
         """Set the verdicts."""
@@ -102,89 +101,40 @@ def stored(numbers: dict) -> list[Row]:
     known = {(row["case"], row["variant"]): row for row in numbers["rows"]}
     absent = {"run": None, "reference": None, "left_out": "not in the stored results", "reference_left_out": "", "error": None}
     rows = []
-    for case in CASES:
-        for variant in case.variants:
-            one = known.get((case.id, variant.name), absent)
-            row = Row(case, variant, one["run"], one["reference"], one["left_out"], one["reference_left_out"], one["error"])
-            row.judge()
-            rows.append(row)
+    for case, variant in VARIANTS.values():
+        one = known.get((case.id, variant.name), absent)
+        rows.append(Row(case, variant, one["run"], one["reference"], one["left_out"], one["reference_left_out"], one["error"]))
+        rows[-1].judge()
     return rows
 
 
-def find(case: str, variant: str) -> tuple[Case, Variant]:
-    """A case by id and its variant by name."""
-    found = next(one for one in CASES if one.id == case)
-    return found, next(one for one in found.variants if one.name == variant)
-
-
-def run(case: Case, variant: Variant, arch: str, finer: int = 1) -> dict:
-    """Run a variant in this process; returns its record."""
-    return Session(case, variant, arch, finer).record()
-
-
 def answer(request: dict) -> dict:
-    """In a child: answer a request with its run."""
-    return {"answer": run(*find(request["case"], request["variant"]), request["arch"], request["finer"])}
+    """In a child: the record of a variant, or of its reference."""
+    return Session(*VARIANTS[request["name"]], request["arch"], request["finer"]).record()
 
 
-def sources() -> str:
-    """A digest of the files that define the cases."""
-    here = Path(__file__).parent
-    return files_digest([*here.glob("hard_cases/*.py"), *here.glob("reference_cases/*.py")])
+def measure(rows: list[Row], runs: Runs, arch: str, references: bool) -> None:
+    """Run all rows, then their references, the cheap ones or all. Raises OutputError."""
+    for row, found in zip(rows, _records(rows, runs, arch, 1)):
+        row.record, row.left_out = (None, found[LEFT_OUT]) if LEFT_OUT in found else (found, "")
+    finer = [
+        row
+        for row in rows
+        if row.record
+        and row.variant.reference
+        and row.record["status"] in ANSWERED
+        and (references or 2.0 * FINER * row.record["seconds"] <= CHEAP_SECONDS)
+    ]
+    for row, found in zip(finer, _records(finer, runs, arch, FINER)):
+        row.reference, row.reference_left_out = (None, found[LEFT_OUT]) if LEFT_OUT in found else (found, "")
+    for row in rows:
+        row.compare()
+        row.judge()
 
 
-@dataclass
-class Runner:
-    """Runs rows in child processes. seconds_left: of the budget; stop_requested: whether to stop; say: prints progress."""
+def _records(rows: list[Row], runs: Runs, arch: str, finer: int) -> Iterator[dict]:
+    def say(request: dict, record: dict) -> str:
+        ended = record[LEFT_OUT] if LEFT_OUT in record else f"{record['status']}, {record['seconds']:.1f} s"
+        return f"{request['name']}{', reference' if finer > 1 else ''}: {ended}"
 
-    arch: str
-    store: Store
-    seconds_left: Callable[[], float]
-    stop_requested: Callable[[], bool]
-    say: Callable[[str], None]
-
-    def measure(self, rows: list[Row], references: bool) -> None:
-        """Run all rows, then the cheap references or all of them. Raises OutputError."""
-        self._carry_out(rows, 1)
-        finer = [
-            row
-            for row in rows
-            if row.record
-            and row.variant.reference
-            and row.record["status"] in ANSWERED
-            and (references or 2.0 * FINER * row.record["seconds"] <= CHEAP_SECONDS)
-        ]
-        self._carry_out(finer, FINER)
-        for row in rows:
-            row.compare()
-            row.judge()
-
-    def _carry_out(self, rows: list[Row], finer: int) -> None:
-        record, left_out = ("record", "left_out") if finer == 1 else ("reference", "reference_left_out")
-        on = [machine() | {"load": None}, code_digest(), sources(), self.arch]
-        requests, waiting = [], {}
-        for row in rows:
-            request = {"case": row.case.id, "variant": row.variant.name, "arch": self.arch, "finer": finer}
-            key = digest([request, on])[:32]
-            kept = self.store.read(key)
-            if kept is None:
-                requests.append((key, request))
-                waiting[key] = row
-            else:
-                setattr(row, record, kept)
-
-        def done(key: str, result: dict) -> None:
-            row = waiting[key]
-            what = f"{row.case.id}, {row.variant.name}{', reference' if finer > 1 else ''}"
-            if "answer" in result:
-                setattr(row, record, self.store.write(key, result["answer"]))
-                self.say(f"{what}: {result['answer']['status']}, {result['answer']['seconds']:.1f} s")
-            else:
-                why = result.get("error") or result["crash"]
-                setattr(row, left_out, why)
-                self.say(f"{what}: {why}")
-
-        places = [LocalPlace(usable_cores(), CHILD)]
-        left = carry_out(requests, places, done, seconds_left=self.seconds_left, stop_requested=self.stop_requested)
-        for key, why in left.items():
-            setattr(waiting[key], left_out, why)
+    return runs.records([{"name": row.name, "arch": arch, "finer": finer} for row in rows], say)

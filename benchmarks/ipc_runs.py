@@ -1,34 +1,30 @@
 """Runs of the scenes of incremental potential contact: each in a process of its own, judged after every step.
 
-A child prints its record as it goes, so that a run that is killed in a long step is not lost.
+A child leaves its record as it goes, so that a run that is killed in a long step is not lost.
 """
 
-import json
 import math
-import os
-import subprocess
-import sys
-import tempfile
 import time
 from dataclasses import asdict, dataclass, field
-from pathlib import Path
 
 import numpy as np
 
 import taisoft as ts
 from taisoft.errors import TaisoftError
+from taisoft.many.places import CUT_BY_BUDGET
 from taisoft.mesh.quality import mean_surface_edge
 from taisoft.records import StepReport
 
 from .ipc_cases import find
 from .ipc_cases.case import Case
 from .ipc_friction import FrictionMeter
-from .runner import HERE, parse_result, print_result, timed, without_warnings
+from .runner import timed, without_warnings
+from .suite import CRASHED, LEFT_OUT, UNFINISHED, leave
 
 OK, DEGRADED, STOPPED, SKIPPED = "ok", "degraded", "stopped", "skipped"
 DISTANCE_EVERY = 10  # steps between two measurements of the least distance
 NEAR = 0.05  # of the mean surface edge: larger distances are not measured
-REPORT_EVERY = 10.0  # [s] between two printed records of a child
+REPORT_EVERY = 10.0  # [s] after which a child leaves its record again
 GRACE = 300.0  # [s] after the budget, for one more step and its judgement
 
 
@@ -46,6 +42,7 @@ class Job:
     tolerance: float = 1e-4
     steps: int | None = None
     friction: bool = False
+    arch: str = "cpu"
 
 
 @dataclass
@@ -157,7 +154,7 @@ def simulator(case: Case, job: Job, scene: ts.Scene) -> ts.Simulator:
     """The simulator of a job."""
     tolerances = {"newton_tolerance": job.tolerance, "contact_tolerance": job.tolerance}
     return ts.Simulator(
-        scene, dt=case.dt, integrator="implicit_euler", self_collision=True, precision=job.precision, **tolerances
+        scene, dt=case.dt, integrator="implicit_euler", self_collision=True, precision=job.precision, arch=job.arch, **tolerances
     )
 
 
@@ -191,50 +188,21 @@ def _advance(sim: ts.Simulator, case: Case, job: Job, record: Record, report) ->
     return record.end()
 
 
-# --- processes --------------------------------------------------------------------------------------------------------
+def answer(request: dict) -> dict:
+    """In a child: the record of a job, which it leaves from time to time."""
+    job = Job(**{key: value for key, value in request.items() if key != UNFINISHED})
+    return run(job, lambda record: leave(request, record.data())).data()
 
 
-def answer(text: str) -> None:
-    """In a child: run the job of this JSON text, and print its record, from time to time and at the end."""
-
-    def report(record: Record) -> None:
-        print_result(record.data())
-
-    report(run(Job(**json.loads(text)), report))
-
-
-def run_child(job: Job, grace: float = GRACE) -> Record:
-    """Run a job in a child process. Returns its last record if it crashes, or is killed `grace` [s] after the budget."""
-    arguments = [sys.executable, "-m", "taisoft", "bench", "ipc", "--child", json.dumps(asdict(job))]
-    paths = os.pathsep.join(filter(None, (str(HERE), os.environ.get("PYTHONPATH"))))
-    with tempfile.TemporaryDirectory() as folder:
-        out, err = Path(folder) / "out", Path(folder) / "err"
-        with out.open("wb") as stdout, err.open("wb") as stderr:
-            child = subprocess.Popen(
-                arguments, env=os.environ | {"PYTHONPATH": paths}, stdin=subprocess.DEVNULL, stdout=stdout, stderr=stderr
-            )
-            try:
-                code = child.wait(job.budget + grace)
-            except subprocess.TimeoutExpired:
-                code = None
-            finally:
-                child.kill()
-                child.wait()
-        found = [one for line in out.read_text(errors="replace").splitlines() if (one := _parsed(line)) is not None]
-        record = Record.read(found[-1]) if found else Record(job)
-        if code is None:
-            record.end(f"killed in a step that outlasted the budget of {job.budget:g} s by {grace:g} s", failed=True)
-        elif code:
-            last = (err.read_text(errors="replace").strip().splitlines() or ["nothing"])[-1]
-            record.end(f"its process ended with status {code}: {last}", failed=True)
+def record_of(job: Job, found: dict) -> Record:
+    """The record of a job that a child answered, or left when it crashed or was killed GRACE [s] after the budget."""
+    if LEFT_OUT not in found:
+        return Record.read(found)
+    record, why = Record.read(found[UNFINISHED]) if UNFINISHED in found else Record(job), found[LEFT_OUT]
+    killed = why == CUT_BY_BUDGET
+    why = f"killed in a step that outlasted the budget of {job.budget:g} s by {GRACE:g} s" if killed else why
+    record.end(why, failed=killed or found[CRASHED])
     return record
-
-
-def _parsed(line: str) -> dict | None:
-    try:
-        return parse_result(line)
-    except ValueError:  # cut by the end of the process
-        return None
 
 
 def mean(values: list) -> float:

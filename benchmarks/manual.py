@@ -33,8 +33,7 @@ from .pictures import picture_table
 from .pictures import run_table as picture_runs
 from .reference_cases.record import label
 from .runner import make_parser
-from .tolerance import Fixed
-from .tolerance import Row as ToleranceRow
+from .tolerance import read_row
 from .tolerance import row_table as tolerance_table
 from .window import window_table
 from .works.table import compare_table
@@ -253,8 +252,7 @@ def error(results: Path) -> str:
 def tolerance(results: Path) -> str:
     """Wished, estimated and true errors."""
     numbers = newest(results, "tolerance")
-    rows = [ToleranceRow(**row | {"best": row["best"] and Fixed(**row["best"])}) for row in numbers["rows"]]
-    return tolerance_table(rows) + measured_on(numbers)
+    return tolerance_table([read_row(row) for row in numbers["rows"]]) + measured_on(numbers)
 
 
 def window(results: Path) -> str:

@@ -1,6 +1,6 @@
 """Wished against obtained errors, and what they cost: the scenes of `taisoft bench error`, run to a tolerance.
 
-taisoft bench tolerance [--scene NAME ...] [--wish PERCENT ...] [--quick] [--out [FILE.json]]
+taisoft bench tolerance [--only NAME ...] [--wish PERCENT ...] [--quick] [--budget SECONDS] [--keep DIR] [--out [FILE.json]]
 
 Each scene runs with tolerances of 10, 1 and 0.1 % (`Simulator(tolerance=)`), and with a grid of fixed settings: all integrators
 at 1 to 64 steps a frame, explicit ones at up to 8 times their least, as long as they are not slower than settings that meet all
@@ -8,33 +8,38 @@ tolerances. Errors are distances at the frames, over the largest
 excursion, to a run in double precision with small steps: 128 a frame, explicit ones 32 times the least, with tolerances of 1e-9,
 and 1e-8 of the contact laws. Implicit and explicit steps have a reference each, since quadratic elements have another mass matrix
 in explicit steps and impacts another law. A reference's own error is its distance to a run with half as many steps.
-References and errors of fixed steps are kept in the user's cache until scenes or code change (`stored_runs`).
+References and errors of fixed steps are kept in the user's cache until scenes or code that runs with given steps change.
 Seconds are from the call of Simulator to the end of the run, with pilots, without compiling: medians of repeated runs, in turns
 with the best fixed setting. With frames: where an observer gets them, as in `taisoft run`, so that a pilot is not the run. Best:
 the fastest fixed setting that meets the tolerance. Exit status: 0, or 1 if a limit is not met.
 """
 
-import argparse
-import dataclasses
 import math
 import statistics
 import sys
 import time
-from dataclasses import dataclass
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
 import taisoft as ts
 from taisoft.display import percent
 from taisoft.dynamics.schemes import EXPLICIT, IMPLICIT, takes_contacts
+from taisoft.errors import OutputError
 from taisoft.estimation.comparison import distance, largest_excursion
 from taisoft.estimation.first_choice import stable_steps
+from taisoft.files import cache_folders
+from taisoft.machine import machine
+from taisoft.many.store import NOT_COMPUTING, Store, code_digest, digest
 
 from .document import Limit, begin, table
 from .error import EXACT, EXPLICIT_FPS
-from .error_cases import CASES, Case
-from .runner import add_named_out, make_parser, named_out, progress, without_warnings
-from .stored_runs import StoredRuns
+from .error_cases import CASES, Case, path_of
+from .runner import files_digest, named_out, without_warnings
+from .suite import LEFT_OUT, chosen, runs_of, suite_options, suite_parser
 
 TOLERANCES = (0.1, 0.01, 0.001)
 STEPS = (1, 2, 4, 8, 16, 32, 64)  # of implicit integrators, a frame
@@ -43,6 +48,9 @@ TRUTH = {False: 128, True: 32}  # steps a frame of the reference, explicit ones 
 REPEATS, SHORT, LONG = 5, 1.0, 10.0  # runs of up to SHORT [s] are repeated; a grid goes no further after one of LONG [s]
 ENOUGH, SLOWEST, MEDIAN = 11 / 12, 2.0, 1.3  # of the scenes that meet a tolerance; times over the best fixed setting
 QUICK = ("hanging beam", "incline")
+HERE = Path(__file__).parent
+SOURCES = (HERE / "error_cases.py", HERE / "reference_cases" / "record.py")  # on which stored runs depend
+NOT_RUNNING = (*NOT_COMPUTING, "estimation")  # folders of taisoft on which they do not
 
 
 @dataclass
@@ -83,6 +91,31 @@ class Row:
         return self.seconds / self.best.seconds if self.best else math.nan
 
 
+def read_row(data: dict) -> Row:
+    """The row of plain data."""
+    return Row(**data | {"best": data["best"] and Fixed(**data["best"])})
+
+
+class Stored:
+    """Arrays of runs with given steps in a folder, by default of the user's cache; none are kept if it cannot be used."""
+
+    def __init__(self, folder: Path | None = None):
+        self._on = [machine() | {"load": None}, code_digest(NOT_RUNNING), files_digest(SOURCES)]
+        self._store = Store()
+        with suppress(StopIteration, OutputError):
+            self._store = Store((folder or next(cache_folders())) / "tolerance")
+
+    def get(self, request: list, compute: Callable[[], np.ndarray]) -> np.ndarray:
+        """The array of a request, plain data, or what `compute` returns, which is then stored."""
+        key = digest([request, self._on])[:32]
+        found = self._store.read(key)
+        if found is None:
+            found = {"array": compute()}
+            with suppress(OutputError):  # the folder is full
+                self._store.write(key, found)
+        return found["array"]
+
+
 def fps_of(case: Case) -> float:
     """Frames per second."""
     return EXPLICIT_FPS if case.dt is None else 60.0
@@ -91,7 +124,7 @@ def fps_of(case: Case) -> float:
 class Scene:
     """The references of a scene, and its frame. least: explicit steps a frame; stored: runs before this one."""
 
-    def __init__(self, case: Case, stored: StoredRuns):
+    def __init__(self, case: Case, stored: Stored):
         self.case, self.frame, self._stored = case, 1.0 / fps_of(case), stored
         with ts.Simulator(case.build(), dt=1e-9, integrator="velocity_verlet") as sim:
             self.least, self.touches = stable_steps(sim.stable_dt, self.frame), sim.touches
@@ -99,10 +132,8 @@ class Scene:
 
     def path(self, integrator: str, steps: int, **settings) -> np.ndarray:
         """Positions (k,n,3) [m] at the frames."""
-        found = []
-        with ts.Simulator(self.case.build(), dt=self.frame / steps, integrator=integrator, **settings) as sim:
-            sim.run(self.case.seconds, on_frame=lambda sim, *_: found.append(sim.positions()), fps=1.0 / self.frame)
-        return np.array(found)
+        scene, dt = self.case.build(), self.frame / steps
+        return path_of(scene, dt, integrator, self.case.seconds, 1.0 / self.frame, **settings)[0]
 
     def truth(self, explicit: bool) -> np.ndarray:
         """Path of the reference."""
@@ -195,7 +226,7 @@ class Scene:
             seconds=seconds[-1],
             observed=seconds[-2],
             pilots=report.pilot_seconds,
-            best=dataclasses.replace(best, seconds=seconds[0]) if best else None,
+            best=replace(best, seconds=seconds[0]) if best else None,
         )
 
 
@@ -235,43 +266,41 @@ def find_limits(rows: list[Row]) -> list[Limit]:
     return [*found, Limit("seconds over the best fixed setting, largest", max(ratios), SLOWEST)]
 
 
-def parser() -> argparse.ArgumentParser:
-    """The options."""
-    made = make_parser("tolerance", __doc__)
-    names = [case.name for case in CASES]
-    made.add_argument("--scene", nargs="+", choices=names, metavar="NAME", help=f"only these: {', '.join(names)}")
-    wishes = [f"{100.0 * one:g}" for one in TOLERANCES]
-    made.add_argument("--wish", nargs="+", choices=wishes, metavar="PERCENT", help=f"only these: {', '.join(wishes)}")
-    made.add_argument("--quick", action="store_true", help=f"only {' and '.join(QUICK)}")
-    add_named_out(made)
-    return made
+def answer(request: dict) -> dict:
+    """In a child: the rows of a scene, and its grid."""
+    with without_warnings():
+        scene = Scene(next(case for case in CASES if case.name == request["name"]), Stored())
+        grid = scene.grid()
+        rows = [asdict(scene.row(wish, grid)) for wish in request["wishes"]]
+    return {"rows": rows, "grid": [asdict(one) for one in grid]}
+
+
+def said(request: dict, found: dict) -> str:
+    """How a scene ended, in a line."""
+    return f"{request['name']}: {found.get(LEFT_OUT) or str(len(found['grid'])) + ' fixed settings'}"
 
 
 def main(argv: list[str] | None = None) -> int:
     """Measure and print. Raises OutputError if a file cannot be written."""
-    options = parser().parse_args(argv)
-    options.arch = "cpu"
+    parser = suite_parser("tolerance", __doc__, f"only {' and '.join(QUICK)}", arch=False)
+    known = {f"{100.0 * one:g}": one for one in TOLERANCES}
+    parser.add_argument(
+        "--wish", nargs="+", choices=known, default=list(known), metavar="PERCENT", help=f"only these: {', '.join(known)}"
+    )
+    options = suite_options(parser, argv, answer)
+    wishes = [known[text] for text in options.wish]
+    names = QUICK if options.quick else [case.name for case in CASES]
+    requests = chosen(parser, options.only, {name: {"name": name, "wishes": wishes} for name in names})
     options.out = named_out(options, "tolerance")
     document, numbers = begin("Runs to a tolerance", "cpu", "f32")
-    names = options.scene or (QUICK if options.quick else [case.name for case in CASES])
-    wishes = [one for one in TOLERANCES if not options.wish or f"{100.0 * one:g}" in options.wish]
-    rows, grids, stored, start = [], {}, StoredRuns(), time.perf_counter()
-
-    def say(what: str) -> None:
-        progress(f"{case.name}: {what}, {time.perf_counter() - start:.0f} s")
-
-    for case in CASES:
-        if case.name in names:
-            with without_warnings():
-                scene = Scene(case, stored)
-                own = [scene.own_error(explicit) for explicit in (True, False)]
-                say(f"references with errors of {percent(own[0])} and {percent(own[1])} %")
-                grids[case.name] = scene.grid()
-                say(f"{len(grids[case.name])} fixed settings")
-                rows += [scene.row(tolerance, grids[case.name]) for tolerance in wishes]
-                say("runs to a tolerance")
+    with runs_of("tolerance", options, "error_cases.py", "tolerance.py", "reference_cases/record.py") as runs:
+        found = {one["name"]: answer for one, answer in zip(requests, runs.records(requests, said)) if LEFT_OUT not in answer}
+    rows, grids = (
+        [read_row(row) for one in found.values() for row in one["rows"]],
+        {name: one["grid"] for name, one in found.items()},
+    )
     document.add(row_table(rows))
-    return document.finish(options, numbers | {"precision": "f32", "rows": rows, "grids": grids}, find_limits(rows))
+    return runs.finish(document, options, numbers | {"precision": "f32", "rows": rows, "grids": grids}, find_limits(rows))
 
 
 if __name__ == "__main__":

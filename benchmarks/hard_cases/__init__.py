@@ -1,7 +1,7 @@
 """All hard cases, group by group."""
 
 from . import contact, geometry, material, scale, self_collision, time_step
-from .case import Case
+from .case import Case, Variant
 
 GROUPS: dict[str, tuple[Case, ...]] = {  # by the catalogue's names
     "material": material.CASES,
@@ -14,3 +14,4 @@ GROUPS: dict[str, tuple[Case, ...]] = {  # by the catalogue's names
     "long run": time_step.LONG_RUN,
 }
 CASES: tuple[Case, ...] = tuple(case for cases in GROUPS.values() for case in cases)
+VARIANTS: dict[str, tuple[Case, Variant]] = {f"{case.id}: {one.name}": (case, one) for case in CASES for one in case.variants}
