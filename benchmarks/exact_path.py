@@ -3,19 +3,12 @@
 A beam 4 x 1 x 1 m of St. Venant-Kirchhoff material, psi = mu E:E + lam/2 tr(E)^2 with E = (F^T F - I)/2, is clamped at
 x = -2 and falls under gravity from rest, undamped. The mesh (five tets per cell) and the lumped mass (a quarter of each tet's
 mass per node) are fixed, so that a solver's difference to this path is its time integration error. SciPy's DOP853 (Runge-Kutta
-of order 8) integrates the ordinary differential equations at two tolerances; the difference of the two paths is stored as the
-uncertainty.
+of order 8) integrates the ordinary differential equations; `works.references` stores paths, and their distance to those of a
+looser tolerance as their uncertainty.
 
 The law has no barrier against inversion: from about t = 0.8 s the beam folds at the clamp and tets invert. The path remains well
-defined (see `convergence` in the data) but unphysical.
-
-`python -m benchmarks.exact_path` integrates all meshes (about a minute) and writes data/falling_beam_svk.npz.
+defined but unphysical.
 """
-
-import argparse
-import time
-from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from scipy.integrate import DOP853
@@ -31,7 +24,6 @@ GRAVITY = 9.8  # m/s^2, along -y
 MESHES = ((12, 3, 3), (24, 6, 6), (48, 12, 12))  # 540, 4,320, 34,560 tets
 SAMPLE = 0.01  # s between stored points of the path
 SECONDS = 1.0
-DATA = Path(__file__).parent / "data" / "falling_beam_svk.npz"
 
 
 class FallingBeam(SemiDiscrete):
@@ -72,57 +64,3 @@ def integrate(beam: FallingBeam, tolerance: float, seconds: float = SECONDS, poi
     if solver.status == "failed":
         raise SimulationError(f"the exact path of the mesh {beam.cells} ends at t = {solver.t:.4f} s: too small a step")
     return times, path
-
-
-@dataclass(frozen=True)
-class ExactPath:
-    """Path of the tip (mean of the end face's nodes), path (k,3) [m] every SAMPLE, and its convergence.
-
-    excursion: largest distance of the tip from its start [m]. convergence (k,): difference to the path at the looser
-    tolerance over the excursion, an upper bound of the path's error.
-    """
-
-    path: np.ndarray
-    excursion: float
-    convergence: np.ndarray
-
-
-def load_exact(cells) -> ExactPath:
-    """The stored exact path of the mesh `cells`. Raises ValueError for a mesh that is not stored."""
-    key = _key(cells)
-    with np.load(DATA) as data:
-        if f"path_{key}" not in data:
-            raise ValueError(f"no exact path is stored for the mesh {key}; stored are {', '.join(map(_key, MESHES))}")
-        path, convergence = data[f"path_{key}"], data[f"convergence_{key}"]
-    return ExactPath(path, float(np.linalg.norm(path - path[0], axis=1).max()), convergence)
-
-
-def _key(cells) -> str:
-    return "x".join(str(c) for c in cells)
-
-
-def regenerate(arguments=None) -> None:
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--out", type=Path, default=DATA, help="file to write (default: %(default)s)")
-    parser.add_argument("--tolerances", type=float, nargs=2, default=(1e-7, 1e-9), metavar=("LOOSE", "TIGHT"))
-    options = parser.parse_args(arguments)
-    stored = {}
-    for cells in MESHES:
-        beam, start = FallingBeam(cells), time.perf_counter()
-        loose, path = (integrate(beam, tolerance)[1] for tolerance in options.tolerances)
-        excursion = np.linalg.norm(path - path[0], axis=1).max()
-        convergence = np.linalg.norm(path - loose, axis=1) / excursion
-        stored[f"path_{_key(cells)}"] = path
-        stored[f"convergence_{_key(cells)}"] = convergence.astype(np.float32)
-        print(
-            f"{_key(cells):>9} {len(beam.tets):6d} tets: excursion {excursion:.9f} m, two tolerances differ by "
-            f"{convergence.max():.1e} of it, {time.perf_counter() - start:.0f} s",
-            flush=True,
-        )
-    options.out.parent.mkdir(parents=True, exist_ok=True)
-    np.savez_compressed(options.out, **stored)
-    print(f"written: {options.out}, {options.out.stat().st_size / 1000:.1f} kB")
-
-
-if __name__ == "__main__":
-    regenerate()

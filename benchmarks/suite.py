@@ -103,12 +103,12 @@ class Runs:
                 self.missing += [told] * (LEFT_OUT in record)
             yield record
 
-    def finish(self, document: Document, options: argparse.Namespace, numbers: dict, limits: Sequence[Limit] = ()) -> int:
+    def finish(self, document: Document, options: argparse.Namespace, numbers: dict, limits: Sequence[Limit] = (), **more) -> int:
         """As `Document.finish`, after a list of what is missing or was damaged; the status is 1 also if something is missing."""
         notes = [*self.missing, *self.store.damaged]
         if notes:
             document.add("\n".join(f"* {note}" for note in notes))
-        return document.finish(options, numbers, limits) or int(bool(self.missing))
+        return document.finish(options, numbers, limits, **more) or int(bool(self.missing))
 
     def _run(self, key: str, request: dict, seconds: float) -> dict:
         end, answers = min(self.end, time.monotonic() + seconds), {}

@@ -18,7 +18,7 @@ from .evaluation import Verdict, evaluate
 from .references import MODELS
 from .scenes import Work
 
-KEPT = ("rounds", "build_seconds", "unconverged", "failure")  # attributes of a row that its record has unchanged
+KEPT = ("rounds", "build_seconds", "unconverged", "failure", "date")  # attributes of a row that its record has unchanged
 ROUND_SECONDS, ROUND_RUNS = 0.3, 10  # a round repeats a run until this wall time or this number is reached
 ENOUGH_SECONDS, ENOUGH_BUILDING = 10.0, 20.0  # wall time of a run and of its building from which it is not repeated
 
@@ -59,8 +59,7 @@ class Row:
 
     def record(self) -> dict:
         """The row as plain data."""
-        same = {name: getattr(self, name) for name in (*KEPT, "date")}
-        return same | {
+        return {name: getattr(self, name) for name in KEPT} | {
             "work": self.work.key,
             "tets": self.work.tets,
             "setting": asdict(self.setting) | {"model": str(self.setting.model), "dt": self.setting.dt},
@@ -69,12 +68,12 @@ class Row:
         }
 
 
-def row_of(work: Work, record: dict, date: str) -> Row:
-    """The row of a record. date: default if the record has none."""
+def row_of(work: Work, record: dict) -> Row:
+    """The row of a record."""
     numbers = {key: value for key, value in record["setting"].items() if key != "dt"}
     setting = Setting(**numbers | {"model": next(model for model in MODELS if str(model) == numbers["model"])})
     verdict = record["verdict"] and Verdict(**record["verdict"])
-    return Row(work, setting, verdict=verdict, date=record.get("date") or date, **{key: record[key] for key in KEPT})
+    return Row(work, setting, verdict=verdict, **{key: record[key] for key in KEPT})
 
 
 def measure(work: Work, programs: Iterable[ModuleType], rounds: int, arch: str = "cpu") -> list[Row]:

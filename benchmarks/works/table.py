@@ -7,7 +7,6 @@ from taisoft.study.results import front
 
 from ..document import Limit
 from ..programs import own
-from ..programs.tried import TRIED
 from .runs import Row, fastest_standing, fastest_within, time_ratio
 
 LEVELS = (1e-2, 1e-3, 1e-4, 1e-5)  # errors at which W1 is compared
@@ -135,12 +134,6 @@ def implicit_table(works: list[list[Row]]) -> str:
         setting = row.setting
         lines.append((row.work.key, setting.program, str(setting), str(setting.model), *found, row.failure))
     return markdown(("work", "program", "setting", "law", "error", "s/sim. s", ""), lines, left=(0, 1, 2, 3, 6))
-
-
-def tried_table() -> str:
-    """Other settings that were tried."""
-    lines = [(program, *one) for program, rows in TRIED.items() for one in rows]
-    return markdown(("program", "work", "tried", "result"), lines, left=(0, 1, 2, 3))
 
 
 def draw(works: list[list[Row]], path: Path) -> None:
