@@ -15,12 +15,12 @@ from taisoft.cli.scene_file import load_module, shipped_files
 from taisoft.errors import SimulationError
 
 from .crossing_heaps import make_heap
+from .hard_cases import VARIANTS
 from .hard_cases.case import EXPLICIT, IMPLICIT, Session
 from .hard_cases.contact import on_slope
 from .hard_cases.geometry import on_knives
 from .hard_cases.scale import bin_scene
 from .hard_cases.shapes import COR, DOWN, SNH, WEIGHTLESS, cube, one_body
-from .hard_runs import find
 from .ipc_cases.falling import needles
 from .ipc_cases.twisted import twist
 
@@ -60,21 +60,20 @@ def demos() -> list[Case]:
     return found
 
 
-# Case, variant, and number of simulators that come before the one whose steps count
-HARD = (
-    ("M1", f"mirrored, {COR}, {EXPLICIT}, dt 0.001 s", 0),
-    ("M2", f"random, {SNH}, {IMPLICIT}, dt 0.01 s", 0),
-    ("T3", "implicit", 0),
-    ("T4", SNH, 0),
-    ("R1", "A", 0),
-    ("C3", "spike", 0),
-    ("S3", "two parts of one", 0),
-    ("S4", SNH, 0),
-    ("G1", f"s 0.0001, {SNH}, {IMPLICIT}", 0),
-    ("X1", f"{COR}, {IMPLICIT}, f32", 1),  # of 1 um
-    ("X3", "64, growing, spatial_hash", 0),
-    ("L1", f"{COR}, f64", 0),
-)
+HARD = {  # variant -> number of simulators that come before the one whose steps count
+    f"M1: mirrored, {COR}, {EXPLICIT}, dt 0.001 s": 0,
+    f"M2: random, {SNH}, {IMPLICIT}, dt 0.01 s": 0,
+    "T3: implicit": 0,
+    f"T4: {SNH}": 0,
+    "R1: A": 0,
+    "C3: spike": 0,
+    "S3: two parts of one": 0,
+    f"S4: {SNH}": 0,
+    f"G1: s 0.0001, {SNH}, {IMPLICIT}": 0,
+    f"X1: {COR}, {IMPLICIT}, f32": 1,  # of 1 um
+    "X3: 64, growing, spatial_hash": 0,
+    f"L1: {COR}, f64": 0,
+}
 
 
 class PartialSession(Session):
@@ -90,16 +89,16 @@ class PartialSession(Session):
         return super().simulator(scene, **changes) if self._before >= 0 else self._make(scene, **self.variant.settings | changes)
 
 
-def _hard(case: str, variant: str, before: int, make: Open) -> None:
-    session = PartialSession(*find(case, variant), make, before)
+def _hard(name: str, before: int, make: Open) -> None:
+    session = PartialSession(*VARIANTS[name], make, before)
     session.case.run(session, **session.variant.parameters)
     raise SimulationError("; ".join(session.problems) or "the case took fewer steps")
 
 
 def hard() -> list[Case]:
     """The chosen hard cases."""
-    precisions = [find(case, variant)[1].settings.get("precision", "f32") for case, variant, _ in HARD]
-    return [Case(f"hard {one[0]}, {one[1]}", precision, 1, partial(_hard, *one)) for one, precision in zip(HARD, precisions)]
+    precisions = {name: VARIANTS[name][1].settings.get("precision", "f32") for name in HARD}
+    return [Case(f"hard {name.replace(':', ',')}", precisions[name], 1, partial(_hard, name, HARD[name])) for name in HARD]
 
 
 # --- ten scenes with contacts -------------------------------------------------------------------------------------------

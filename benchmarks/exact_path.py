@@ -14,7 +14,6 @@ import numpy as np
 from scipy.integrate import DOP853
 
 from taisoft.errors import SimulationError
-from taisoft.mesh.shapes import box_mesh
 
 from .works.semi_discrete import SemiDiscrete
 
@@ -26,22 +25,11 @@ SAMPLE = 0.01  # s between stored points of the path
 SECONDS = 1.0
 
 
-class FallingBeam(SemiDiscrete):
-    """The semi-discrete beam, by default that of the stored path. cells: (nx, ny, nz); tip (k,): nodes of the free end x = 2."""
+def integrate(beam: SemiDiscrete, tolerance: float, points: np.ndarray, seconds: float = SECONDS):
+    """Times (k,) [s], every SAMPLE, and the positions (k,3) [m] of the mean of some vertices, (p,) indices.
 
-    def __init__(self, cells, law: str = "SVK", young: float = YOUNG, equal_masses: bool = False) -> None:
-        mesh = box_mesh(cells, SIZE)
-        free = mesh.vertices[:, 0] > -SIZE[0] / 2 + 1e-9
-        super().__init__(mesh, law, young, POISSON, DENSITY, GRAVITY, free, equal_masses=equal_masses)
-        self.cells, self.tip = tuple(cells), np.flatnonzero(self.vertices[:, 0] > SIZE[0] / 2 - 1e-9)
-
-
-def integrate(beam: FallingBeam, tolerance: float, seconds: float = SECONDS, points=None):
-    """Times (k,) [s], every SAMPLE, and the positions (k,3) [m] of the mean of `points`, by default of the tip's nodes.
-
-    tolerance: relative, and absolute in m and m/s, of the error of one step.
+    tolerance: relative, and absolute in m and m/s, of the error of one step. Raises SimulationError if it fails.
     """
-    points = beam.tip if points is None else points
     n = len(beam.vertices)
 
     def rate(_, y):
@@ -62,5 +50,5 @@ def integrate(beam: FallingBeam, tolerance: float, seconds: float = SECONDS, poi
                 path[k] += between(min(times[k], solver.t)).reshape(2, 3, n)[0][:, points].mean(axis=1)
             done = reached
     if solver.status == "failed":
-        raise SimulationError(f"the exact path of the mesh {beam.cells} ends at t = {solver.t:.4f} s: too small a step")
+        raise SimulationError(f"the exact path of {len(beam.tets)} tets ends at t = {solver.t:.4f} s: too small a step")
     return times, path

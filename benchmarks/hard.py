@@ -6,12 +6,12 @@ taisoft bench hard --judge FILE.json
 
 Each case runs in several variants: laws, integrators, precisions, initial states. The catalogue and physics determine how each
 variant must end: ok, degraded by what the setting itself causes, refused before the first step, or stopped later. A variant is
-solved if it ends so and meets all its limits. Each variant runs in its own process, which makes its peak memory measurable. Wall
-time is that of the steps without compilation, step time the median. A limit is measured, analytic or proposed; if another
-baseline replaces a proposed limit, the table shows both. Error: the largest distance of a node, at about 20 times, to the same
-run in f64 with an eighth of the step, over the case's size; "-" if that run would take long (--references runs all) or has no
-comparable shape. --keep stores finished runs in DIR, and the same command resumes there. --judge runs nothing: it compares stored
-results with today's limits and rewrites FILE.json and its page. Exit status: 0, or 1 if a variant is not solved or was not run.
+solved if it ends so and meets all its limits. Each variant runs in its own process, which makes its peak memory measurable.
+Wall time is that of the steps without compilation, step time the median. A limit is measured, analytic or proposed. Error: the
+largest distance of a node, at about 20 times, to the same run in f64 with an eighth of the step, over the case's size; "-" if
+that run would take long (--references runs all) or has no comparable shape. --keep stores finished runs in DIR, and the same
+command resumes there. --judge runs nothing: it compares stored results with today's limits and rewrites FILE.json and its page.
+Exit status: 0, or 1 if a variant is not solved or was not run.
 """
 
 import argparse

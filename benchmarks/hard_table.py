@@ -143,9 +143,7 @@ def limit(verdict: Verdict) -> str:
         return NOTHING
     if isinstance(verdict.limit, str):
         return verdict.limit
-    sign = ">=" if verdict.at_least else "<="
-    replaced = "" if verdict.asked is None else f" (asked: {verdict.asked:g})"
-    return f"{sign} {verdict.limit:.4g}{replaced}"
+    return f"{'>=' if verdict.at_least else '<='} {verdict.limit:.4g}"
 
 
 def _or_nothing(value: float | None, unit: float, form: str) -> str:

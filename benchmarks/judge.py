@@ -16,10 +16,9 @@ from fractions import Fraction
 
 import ipctk
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from taisoft import Simulator
+from taisoft.mesh.solids import connected_parts, winding_numbers
 from taisoft.scene.obstacles import Capsule, HalfSpace, Sphere
 
 DET_ERROR = 1e-15  # bound of the rounding error of a determinant, relative to the sum of its absolute terms
@@ -88,15 +87,6 @@ def triangle_distance(x: np.ndarray, a: np.ndarray, b: np.ndarray) -> float:
     return float(np.sqrt(least))
 
 
-def winding_numbers(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
-    """How often (k,) a surface winds around points (k,3): 1 inside a closed one, 0 outside. corners: (n,3,3) of its triangles
-    [m]."""
-    a, b, c = np.moveaxis(corners - points[:, None, None], 2, 0)
-    la, lb, lc = (np.linalg.norm(one, axis=2) for one in (a, b, c))
-    dots = (a * b).sum(axis=2) * lc + (b * c).sum(axis=2) * la + (c * a).sum(axis=2) * lb
-    return np.arctan2((a * np.cross(b, c)).sum(axis=2), la * lb * lc + dots).sum(axis=1) / (2.0 * np.pi)
-
-
 def separation(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """How far (n,) [m] triangles of (n,3,3) corners must move to part; 0 if they are apart. By separating axes."""
     ea, eb = np.roll(a, -1, axis=1) - a, np.roll(b, -1, axis=1) - b
@@ -144,15 +134,9 @@ class Judge:
         self._attached = {frozenset((one.a, one.b)) for one in sim.scene.exact_attachments}
         x, faces = self.vertices(), np.asfortranarray(self.triangles.astype(np.int32))
         self._mesh = ipctk.CollisionMesh(np.asfortranarray(x), ipctk.edges(faces), faces)
-        self._components = [self._one_of_each_component(own) for own in self._of]
+        parts = connected_parts(self.triangles)
+        self._components = [[np.unique(self.triangles[own][parts[own] == k]) for k in np.unique(parts[own])] for own in self._of]
         self._solid = [self._is_solid(x, own) for own in self._of]
-
-    def _one_of_each_component(self, own: np.ndarray) -> list[np.ndarray]:
-        """The vertices of each connected component of some triangles."""
-        vertices, t = np.unique(self.triangles[own], return_inverse=True)
-        i, j = t.reshape(-1, 3)[:, [0, 1, 2, 1, 2, 0]].reshape(-1, 2, 3).transpose(1, 0, 2).reshape(2, -1)
-        label = connected_components(coo_array((np.ones(len(i)), (i, j)), shape=(len(vertices),) * 2), directed=False)[1]
-        return [vertices[label == k] for k in range(label.max() + 1)]
 
     def _is_solid(self, x: np.ndarray, own: np.ndarray) -> bool:
         """Whether triangles bound a volume from outside."""
@@ -223,7 +207,7 @@ class Judge:
             for j, name, part in points:
                 may_touch = j != k and min(j, k) < self._n_soft and not self._are_attached(name, self._names[k])
                 if may_touch and (part > lo).all() and (part < hi).all():
-                    found[name, self._names[k]] += winding_numbers(part[:1], corners)[0] > 0.5
+                    found[name, self._names[k]] += winding_numbers(corners, part[:1])[0] > 0.5
         return +found
 
     def inside(self) -> int:
@@ -238,7 +222,7 @@ class Judge:
                 if j != k and min(j, k) < self._n_soft and not self._are_attached(self._names[j], self._names[k]):
                     points = x[np.concatenate(parts)]
                     near = points[((points > lo) & (points < hi)).all(axis=1)]
-                    found += int((np.abs(winding_numbers(near, corners)) > 0.5).sum())
+                    found += int((np.abs(winding_numbers(corners, near)) > 0.5).sum())
         return found
 
     def least_distance(self, within: float) -> float:

@@ -1,6 +1,6 @@
 """Regression: error, iterations, memory and time of short cases against those stored.
 
-taisoft bench regression [--update] [--case NAME] [--arch cpu|cuda]
+taisoft bench regression [--update] [--only NAME ...] [--arch cpu|cuda]
 
 The numbers are in benchmarks/data/regression.json, separately for each arch. They reveal drifts within limits: an error that has
 doubled, a solver that needs more iterations. A number counts as the same within
@@ -37,6 +37,7 @@ from taisoft.output.tables import markdown
 
 from .regression_cases import CASES, Case, Found
 from .runner import add_arch, make_parser, progress
+from .suite import add_only, chosen
 
 STORE = Path(__file__).resolve().parent / "data" / "regression.json"
 ERROR_MARGIN, COUNT_MARGIN, COUNT_LEAST, MEMORY_MARGIN = 0.05, 0.05, 2, 1e-3
@@ -111,12 +112,6 @@ def store(entries: dict[str, Entry], arch: str, path: Path) -> None:
     write_bytes(path, json_text(dict(sorted(whole.items()))).encode())
 
 
-def check(case: Case, arch: str, stored: dict[str, Entry], unit: float = 1.0) -> tuple[Entry, list[str]]:
-    """Compute a case and compare it with its stored entry. Raises KeyError without one."""
-    new = make_entry(case.run(arch), stored[case.name].reference, unit)
-    return new, differences(case, new, stored[case.name])
-
-
 def row(case: Case, new: Entry, old: Entry | None, seconds: float) -> tuple[str, ...]:
     """A line of the table."""
     counts = ", ".join(f"{n:,} {name}" for name, n in new.counts.items())
@@ -133,12 +128,10 @@ def main(argv=None) -> int:
     """Compute, compare and print. Raises OutputError, or SimulationError if the arch is not available."""
     parser = make_parser("regression", __doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--update", action="store_true", help="store the new numbers")
-    parser.add_argument("--case", metavar="NAME", help="only cases with this prefix")
+    add_only(parser)
     add_arch(parser)
     options = parser.parse_args(argv)
-    cases = [case for case in CASES if case.name.startswith(options.case or "")]
-    if not cases:
-        parser.error(f"no case begins with {options.case!r}; there are {', '.join(case.name for case in CASES)}")
+    cases = chosen(parser, options.only, {case.name: case for case in CASES})
     stored, entries, lines, changes = load(options.arch, STORE), {}, [], []
     missing = [case.name for case in cases if case.name not in stored]
     if missing and not options.update:

@@ -103,17 +103,15 @@ def explicit(dt: float, **more) -> dict[str, Any]:
 class Criterion:
     """A limit on a number of a case.
 
-    quantity: name of the number. basis: one of MEASURED, ANALYTIC, PROPOSED. at_least: a lower limit. asked: the catalogue's
-    limit, if replaced by a baseline. note: explanation of the replacement. of: parameters and settings of the variants it
-    applies to, by name; empty for all. cost: a limit on time, memory or iterations; a run that misses it is not solved, but
-    not wrong.
+    quantity: name of the number. basis: one of MEASURED, ANALYTIC, PROPOSED. at_least: a lower limit. note: why it is not the
+    catalogue's. of: parameters and settings of the variants it applies to, by name; empty for all. cost: a limit on time,
+    memory or iterations; a run that misses it is not solved, but not wrong.
     """
 
     quantity: str
     limit: float
     basis: str
     at_least: bool = False
-    asked: float | None = None
     note: str = ""
     of: dict[str, Any] = field(default_factory=dict)
     cost: bool = False
@@ -151,7 +149,7 @@ class Case:
 
     def add_limit(self, quantity: str, limit: float, basis: str, at_least=False, note="", cost=False, **of) -> None:
         """Add a criterion, see Criterion."""
-        self.criteria.append(Criterion(quantity, limit, basis, at_least, None, note, of, cost))
+        self.criteria.append(Criterion(quantity, limit, basis, at_least, note, of, cost))
 
     def add_shortfall(self, cause: str, next_idea: str, **of) -> None:
         """Explain variants that are not solved, see Shortfall."""
@@ -175,7 +173,6 @@ class Verdict:
     limit: float | str | None = None
     at_least: bool = False
     basis: str = ""
-    asked: float | None = None
     passed: bool | None = None  # None without a limit
     cost: bool = False
 
@@ -190,7 +187,7 @@ def judge(case: Case, variant: Variant, record: dict) -> list[Verdict]:
     for c in criteria:
         value = numbers.get(c.quantity)  # null if not finite, absent in a failed run
         met = value is not None and c.met(value)
-        verdicts.append(Verdict(c.quantity, value, c.limit, c.at_least, c.basis, c.asked, met, c.cost))
+        verdicts.append(Verdict(c.quantity, value, c.limit, c.at_least, c.basis, met, c.cost))
     judged = {c.quantity for c in criteria}
     return verdicts + [Verdict(name, value) for name, value in numbers.items() if name not in judged]
 

@@ -17,7 +17,7 @@ import numpy as np
 
 from taisoft.errors import SimulationError
 
-from ..exact_path import DENSITY, POISSON, SAMPLE, FallingBeam, integrate
+from ..exact_path import DENSITY, POISSON, SAMPLE, integrate
 from .scenes import WORKS, Work
 from .semi_discrete import SemiDiscrete
 
@@ -61,16 +61,22 @@ def observed(work: Work, positions: np.ndarray, mass: np.ndarray) -> np.ndarray:
     """The compared quantity from positions (k,n,3) [m]: W1's tip (k,3), W2's height of the mass centre (k,1)."""
     if work.cells is None:
         return (positions[:, :, 1] @ mass / mass.sum())[:, None]
+    return positions[:, tip(work)].mean(axis=1)
+
+
+def tip(work: Work) -> np.ndarray:
+    """Indices of the nodes of W1's end face."""
     x = work.start[:, 0]
-    return positions[:, x > x.max() - 1e-9].mean(axis=1)
+    return np.flatnonzero(x > x.max() - 1e-9)
 
 
 def masses(work: Work, model: Model) -> np.ndarray:
     """Masses of all nodes (n,) [kg], body after body."""
-    return np.concatenate([_semi_discrete(work, k, model).mass for k in range(len(work.bodies))])
+    return np.concatenate([semi_discrete(work, k, model).mass for k in range(len(work.bodies))])
 
 
-def _semi_discrete(work: Work, k: int, model: Model) -> SemiDiscrete:
+def semi_discrete(work: Work, k: int, model: Model) -> SemiDiscrete:
+    """Body k of a work with a program's law and masses."""
     body = work.bodies[k]
     numbers = (model.law, body.young, POISSON, DENSITY, work.gravity)
     return SemiDiscrete(body.mesh, *numbers, ~body.fixed, equal_masses=model.equal_masses)
@@ -100,12 +106,11 @@ def fall_on_ground(body: SemiDiscrete, friction: float, dt: float, seconds: floa
 
 def make(work: Work, model: Model) -> tuple[np.ndarray, float]:
     """Compute a path and its uncertainty."""
+    body = semi_discrete(work, 0, model)
     if work.cells is None:
-        body = _semi_discrete(work, 0, model)
         loose, path = (fall_on_ground(body, work.friction, dt, work.seconds) for dt in (DT, DT / 2))
     else:
-        beam = FallingBeam(work.cells, model.law, work.bodies[0].young, model.equal_masses)
-        loose, path = (integrate(beam, tolerance)[1] for tolerance in TOLERANCES)
+        loose, path = (integrate(body, tolerance, tip(work))[1] for tolerance in TOLERANCES)
     return path, Reference(work, path, 0.0).error(loose)
 
 

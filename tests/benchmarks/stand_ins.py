@@ -5,8 +5,9 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+import pytest
 
-from benchmarks import ipc_runs
+from benchmarks import ipc_runs, suite
 from taisoft.dynamics.schemes import EXPLICIT
 from taisoft.nested import from_json, to_json
 from taisoft.records import StepReport
@@ -61,15 +62,20 @@ class ModelSimulator:
         return SimpleNamespace(**found, wall_seconds=1.0, pilot_seconds=0.5, error_estimate=known)
 
 
-def answered(module) -> Callable:
-    """Instead of `carry_out`: requests are answered in this process, with what JSON leaves of the answers."""
+def answer_here(patch: pytest.MonkeyPatch, answer: Callable[[dict], dict]) -> None:
+    """Let requests of suites be answered in this process, with what JSON leaves of the answers."""
 
     def carry_out(requests, places, done, **_):
         for key, request in requests:
-            done(key, from_json(to_json(module.answer(request))))
+            done(key, {"answer": from_json(to_json(answer(request)))})
         return {}
 
-    return carry_out
+    patch.setattr(suite, "carry_out", carry_out)
+
+
+def ipc_answer(request: dict) -> dict:
+    """What a child of `taisoft bench ipc` answers."""
+    return ipc_record(ipc_runs.Job(**{key: value for key, value in request.items() if key != suite.UNFINISHED})).data()
 
 
 def ipc_record(job=None, **more) -> ipc_runs.Record:

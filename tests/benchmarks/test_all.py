@@ -4,7 +4,7 @@ Where a benchmark has no small form, one is made here. Stand-ins take the place 
 
 * implicit steps with contacts, which take a minute to compile: contact and crossings take explicit ones, ipc shows made-up rows,
   and so do order and launches;
-* child processes, whose work is done in this process: crossings, hard, many, pictures, scaling;
+* child processes, whose work is done in this process: crossings, error, hard, many, pictures, scaling, tolerance;
 * the simulators of error and tolerance, by one with known errors; the display of window.
 
 The long runs do without them. The others run in test_cuda_check.py, test_document.py (figures, manual), test_peers.py and
@@ -17,6 +17,7 @@ import math
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -29,6 +30,7 @@ from benchmarks import (
     contact,
     contact_runs,
     elasticity,
+    error,
     gym,
     hard_runs,
     launches,
@@ -46,11 +48,10 @@ from benchmarks.elasticity_steps import Cost, Frames
 from benchmarks.order_runs import Row as OrderRow
 from benchmarks.scaling_bytes import measure_copy
 from benchmarks.scaling_runs import measure
-from benchmarks.stored_runs import StoredRuns
 from taisoft.dynamics.schemes import EXPLICIT, IMPLICIT
 from taisoft.view.pictures import picture_writer
 from tests.benchmarks import stand_ins
-from tests.benchmarks.stand_ins import SOLVER, SPACE, TIME, ModelSimulator, answered
+from tests.benchmarks.stand_ins import SOLVER, SPACE, TIME, ModelSimulator, answer_here
 from tests.many import makes
 from tests.many.stand_in import InProcess
 
@@ -99,7 +100,7 @@ def crossings_small(patch, folder):
     demo = crossing_runs.load_module(crossing_runs.shipped_files("demos")["cube_on_box"])
     settings = {"dt": 1 / 240, "integrator": "symplectic_euler", "seconds": 5 / 240, "fps": 240.0}
     replace(patch, crossing_runs, load_module=lambda _: SimpleNamespace(build=demo.build, solver=settings))
-    replace(patch, crossing_runs, carry_out=answered(crossing_runs))
+    answer_here(patch, crossing_runs.answer)
     replace(patch, crossings, QUICK={"demos": ("cube_on_box",)})
 
 
@@ -112,6 +113,7 @@ def elasticity_small(patch, folder):
 
 def error_small(patch, folder):
     patch.setattr(ts, "Simulator", ModelSimulator)
+    answer_here(patch, error.answer)
 
 
 def error_check(n):
@@ -143,13 +145,11 @@ def gym_check(n):
 
 
 def hard_small(patch, folder):
-    replace(patch, hard_runs, carry_out=answered(hard_runs))
+    answer_here(patch, hard_runs.answer)
 
 
 def ipc_small(patch, folder):
-    from benchmarks import ipc
-
-    replace(patch, ipc, run_child=stand_ins.ipc_record)
+    answer_here(patch, stand_ins.ipc_answer)
 
 
 def many_small(patch, folder):
@@ -202,7 +202,8 @@ def tolerance_small(patch, folder):
     """Without limits on times, which other processes on the machine may lengthen."""
     patch.setattr(ts, "Simulator", ModelSimulator)
     replace(patch, tolerance, MEDIAN=math.inf, SLOWEST=math.inf)
-    replace(patch, tolerance, StoredRuns=lambda: StoredRuns(folder))
+    replace(patch, tolerance, Stored=partial(tolerance.Stored, folder))
+    answer_here(patch, tolerance.answer)
 
 
 def tolerance_check(n):
@@ -240,7 +241,7 @@ def launches_small(patch: pytest.MonkeyPatch, folder: Path) -> None:
     replace(patch, launches, measure=lambda arch, quick: rounds)
 
 
-BEAM = ("--scene", "hanging beam")
+BEAM = ("--only", "hanging beam")
 RUNS = {
     "collision": Small(QUICK, ("| pile 1 | proximity | 162 |", "(fig. 18)", "| yes |"), collision_small, collision_check),
     "contact": Small(QUICK, ("| cube_on_box | 215 |", "| parallel |", "Left out: they are"), contact_small, contact_check),
@@ -257,14 +258,14 @@ RUNS = {
         gym_small,
         gym_check,
     ),
-    "hard": Small(("--case", "G1", "--quick"), ("# Hard cases", "**1 of 1 variants are solved.**"), hard_small),
-    "ipc": Small(("--quick", "--scene", "twisted_mat"), ("| twisted mat | 800 | 1,805 | 0.04 | 0.08 of 25 (2) |",), ipc_small),
+    "hard": Small(("--only", "G1", "--quick"), ("# Hard cases", "**1 of 1 variants are solved.**"), hard_small),
+    "ipc": Small(("--quick", "--only", "twisted_mat"), ("| twisted mat | 800 | 1,805 | 0.04 | 0.08 of 25 (2) |",), ipc_small),
     "launches": Small(QUICK, ("| 200 | 2.00 (1.00 to 3.00) |", "| resting | 200 (100 to 300) |"), launches_small),
     "laws": Small(QUICK, ("| psi of SNH | stable_neo_hookean |", "| psi of F | st_venant_kirchhoff |"), laws_small),
     "many": Small(QUICK, ("| sums | 6 |", "| killed and called again |", "| met |"), many_small, many_check),
     "order": Small(QUICK, ("| SNH | 1 | 1 | 11x2x2 | 220 | 108 | -2.26758 | 16.3 |",), order_small),
     "pictures": Small(QUICK, ("| kernels |", "| PNG |", "| hanging_beam |"), pictures_small, pictures_check),
-    "regression": Small(("--case", "search, two"), ("| search, two cubes | f32 |", "nothing has changed")),
+    "regression": Small(("--only", "search, two"), ("| search, two cubes | f32 |", "nothing has changed")),
     "robots": Small(QUICK, ("| 2 | 8 |", "weak, amplitude 0.", "| of it MuJoCo and exchange |")),
     "scaling": Small(
         ("--sizes", "20", "--kind", "explicit"), ("| explicit | 20 | 1 |", "no earlier run"), scaling_small, scaling_check

@@ -19,7 +19,7 @@ from benchmarks import crossing_runs, crossing_shots, crossings
 from benchmarks.crossing_heaps import KINDS, make_heap
 from benchmarks.crossing_runs import HEAPS, JudgedSimulator, Watch
 from benchmarks.judge import Judge
-from tests.benchmarks.stand_ins import answered
+from tests.benchmarks.stand_ins import answer_here
 
 
 def content(heap) -> list:
@@ -131,7 +131,7 @@ def test_stored_runs_are_reused(monkeypatch, tmp_path, capsys):
 
     monkeypatch.setattr(crossings, "QUICK", {HEAPS: ("heap 001",)})
     monkeypatch.setattr(crossing_runs, "run", run)
-    monkeypatch.setattr(crossing_runs, "carry_out", answered(crossing_runs))
+    answer_here(monkeypatch, crossing_runs.answer)
     command = ["--what", HEAPS, "--quick", "--keep", str(tmp_path / "kept"), "--out", str(tmp_path / "out.json")]
     assert crossings.main(command) == 1
     text, rows = capsys.readouterr().out, json.loads((tmp_path / "out.json").read_text())["rows"]

@@ -17,17 +17,18 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from benchmarks import document, figures, manual, report, stored_runs
+from benchmarks import document, figures, manual, report, tolerance
 from benchmarks.document import Limit, agrees, crossovers, exponent
 from benchmarks.manual import BLOCK, TABLES, filled, newest, pages
 from benchmarks.report_parts.page import AGREE, DISAGREE, MISSING, PARTLY, Claim, Part, small_png, verdict_of
-from benchmarks.stored_runs import StoredRuns
+from benchmarks.tolerance import Stored
 from taisoft.cli.scene_file import shipped_files
 from taisoft.errors import OutputError
 from taisoft.machine import summarise
 
 WRITING = (  # benchmarks with --out FILE.json; those without have no file of that name to refuse
-    "collision contact crossings elasticity error hard ipc launches order peers pictures scaling startup tolerance window"
+    "collision contact crossings elasticity error hard ipc launches order peers pictures references scaling startup tolerance "
+    "window"
 ).split()
 TEXT = "before\n<!-- begin fake -->\nold\n<!-- end fake -->\nafter\n"
 
@@ -76,7 +77,7 @@ def test_bad_options_are_refused_before_measuring(tmp_path, capsys):
                 wrong.append(f"{name} wrote {path}")
             except OutputError as error:
                 wrong += [] if message in str(error) else [f"{name}: {error}"]
-    for name in set(WRITING) | {"references", "regression", "report", "cuda_check", "figures", "manual"}:
+    for name in set(WRITING) | {"regression", "report", "cuda_check", "figures", "manual"}:
         with pytest.raises(SystemExit):
             importlib.import_module(f"benchmarks.{name}").main(["--nothing"])
     with pytest.raises(OutputError, match=r"must end in \.png"):
@@ -86,16 +87,16 @@ def test_bad_options_are_refused_before_measuring(tmp_path, capsys):
 
 def test_arrays_are_stored_until_the_code_changes(tmp_path, monkeypatch):
     def get(value: float, request: int = 1) -> float:
-        return float(StoredRuns(tmp_path).get(["request", request], lambda: np.array(value)))
+        return float(Stored(tmp_path).get(["request", request], lambda: np.array(value)))
 
     assert [get(1.0), get(2.0), get(3.0, request=2)] == [1.0, 1.0, 3.0]
-    for file in tmp_path.iterdir():
+    for file in tmp_path.rglob("*.json"):
         file.write_bytes(b"damaged")
     assert [get(4.0), get(5.0)] == [4.0, 4.0]
-    monkeypatch.setattr(stored_runs, "code_digest", lambda _: "other")
+    monkeypatch.setattr(tolerance, "code_digest", lambda _: "other")
     assert get(6.0) == 6.0
     (tmp_path / "file").touch()
-    assert float(StoredRuns(tmp_path / "file").get([], lambda: np.array(7.0))) == 7.0
+    assert float(Stored(tmp_path / "file").get([], lambda: np.array(7.0))) == 7.0
 
 
 def test_figures_come_from_every_benchmark(tmp_path, monkeypatch, capsys):

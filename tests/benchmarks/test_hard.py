@@ -52,7 +52,6 @@ def test_data_are_complete(shared):
         criteria, shortfalls = ([of(variant) for variant in case.variants] for of in (case.criteria_of, case.shortfalls_of))
         assert any(criteria) and {id(c) for own in criteria for c in own} == set(map(id, case.criteria))
         assert all(len({c.quantity for c in own}) == len(own) for own in criteria)
-        assert all(c.note for c in case.criteria if c.asked is not None)
         assert {id(s) for own in shortfalls for s in own} == set(map(id, case.shortfalls))
         for must in {variant.must for variant in case.variants}:
             assert must.end in (OK, DEGRADED, REFUSED, STOPPED) and (must.causes or must.end != DEGRADED)

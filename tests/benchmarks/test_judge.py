@@ -159,7 +159,7 @@ def test_attached_bodies_may_cross():
 def test_winding_numbers():
     mesh = ts.box_mesh((2, 2, 2), (1.0, 1.0, 1.0))
     points = np.array([(0.1, 0.2, 0.3), (0.499, 0.0, 0.1), (0.501, 0.0, 0.1), (3.0, 2.0, 1.0)])
-    assert judging.winding_numbers(points, mesh.vertices[mesh.surface]) == pytest.approx([1.0, 1.0, 0.0, 0.0], abs=1e-12)
+    assert judging.winding_numbers(mesh.vertices[mesh.surface], points) == pytest.approx([1.0, 1.0, 0.0, 0.0], abs=1e-12)
     scene = ts.Scene()
     for k, (size, at) in enumerate(((1.0, 0.0), (0.2, 0.0), (0.2, 0.5), (0.2, 2.0))):
         scene.add_body(ts.box_mesh((1, 1, 1), (size,) * 3), ts.Material(), name=f"cube {k}", position=(at, 0.03, 0.01))

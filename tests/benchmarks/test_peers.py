@@ -1,18 +1,22 @@
 """The comparison with other programs:
 
 * laws in NumPy reduce to linear elasticity at small strains, are frame-indifferent, and agree with taisoft's stresses;
-* references are stored and converged, their errors relative to the length that each work defines;
+* integration gives the independent reference path of a coarse beam; references are stored, converged and those of this code,
+  their errors relative to the length that each work defines;
 * verdicts detect bodies that fall, lean, invert or penetrate; limits compare the fastest accurate settings.
 """
+
+import json
 
 import numpy as np
 import pytest
 
 import taisoft as ts
+from benchmarks.exact_path import integrate
 from benchmarks.programs import own
 from benchmarks.programs.session import Setting
 from benchmarks.works import evaluation, references, scenes
-from benchmarks.works.references import MODELS, TAISOFT
+from benchmarks.works.references import MODELS, MUJOCO, TAISOFT
 from benchmarks.works.runs import Row, fastest_standing, fastest_within
 from benchmarks.works.semi_discrete import LAWS
 from benchmarks.works.table import limits_of
@@ -52,6 +56,19 @@ def test_references_are_stored_and_converged():
             excursion = np.linalg.norm(reference.path - reference.path[0], axis=1).max()
             expected = np.sqrt(0.01**2 / 101) / 0.5 if work.cells is None else 0.01 / excursion
             assert reference.error(reference.path) == 0.0 and reference.error(moved) == pytest.approx(expected)
+
+
+def test_integration_gives_the_reference_path(shared):
+    value = json.loads((shared / "references" / "beam_fall_semidiscrete.json").read_text())["value"]["SVK_lumped"]
+    beam = references.semi_discrete(scenes.hanging_beam((11, 2, 2)), 0, MUJOCO)
+    node = np.flatnonzero(np.all(np.isclose(beam.vertices, [2, 0, 0]), axis=1))
+    t, path = integrate(beam, 1e-9, node)
+    assert np.allclose(t[10::10], value["t"][:10])
+    assert np.abs(path[10::10] - np.array(value["probe_x"])[:10]).max() < 1e-8  # m
+    work = scenes.hanging_beam(CELLS)
+    stored = references.load(work, MUJOCO).path
+    _, path = integrate(references.semi_discrete(work, 0, MUJOCO), 1e-8, references.tip(work), seconds=0.1)
+    assert np.linalg.norm(path - stored[: len(path)], axis=1).max() < 4e-7  # m, of an excursion of 4 m
 
 
 def at_rest(work: scenes.Work, samples: int = 3) -> np.ndarray:
