@@ -140,14 +140,11 @@ def failed(rows: list[dict]) -> bool:
     return any(row.get(key) for row in rows for key in ("crossing", "starts_crossing", "tunnelled", CRASHED))
 
 
-def said(request: dict, row: dict) -> str:
+def summary(row: dict) -> str:
     """How a run ended, in a line."""
-    if LEFT_OUT in row:
-        return f"{request['name']}: {row[LEFT_OUT]}"
     first = f" from step {row['first']['step']} on" if row["first"] else ""
     first += "" if row["tunnelled"] is None else f", tunnelled in step {row['tunnelled']}"
-    cross = f"{row['crossing']} of {row['states']} states cross{first}"
-    return f"{request['name']}: {cross}, {row['status']}, {row['seconds']:.0f} s"
+    return f"{row['crossing']} of {row['states']} states cross{first}, {row['status']}, {row['seconds']:.0f} s"
 
 
 def main(argv=None) -> int:
@@ -163,7 +160,8 @@ def main(argv=None) -> int:
     options.out = named_out(options, "crossings")
     document, numbers = begin(TITLE, f"arch {options.arch}", packages=("taichi", "numpy", "ipctk"))
     with runs_of("crossings", options, *FILES) as runs:
-        rows = [{"group": one["group"], "name": one["name"]} | row for one, row in zip(requests, runs.records(requests, said))]
+        found = zip(requests.items(), runs.records(requests, summary))
+        rows = [{"group": one["group"], "name": name} | row for (name, one), row in found]
     for part in (*page(rows), *runs.store.damaged):
         document.add(part)
     selected = {key: getattr(options, key) for key in ("what", "only", "count")}

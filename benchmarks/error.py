@@ -170,11 +170,6 @@ def answer(request: dict) -> dict:
         return asdict(measured(case) if isinstance(case, Case) else force_row(case))
 
 
-def said(request: dict, row: dict) -> str:
-    """How a case ended, in a line."""
-    return f"{request['name']}: {row.get(LEFT_OUT, 'measured')}"
-
-
 def main(argv: list[str] | None = None) -> int:
     """Measure and print. Raises OutputError if a file cannot be written."""
     parser = suite_parser("error", __doc__, f"only {' and '.join(QUICK)}", arch=False)
@@ -183,7 +178,7 @@ def main(argv: list[str] | None = None) -> int:
     options.out = named_out(options, "error")
     document, numbers = begin("Estimated against true errors", options.arch, "f32")
     with runs_of("error", options, "error*.py", "reference_cases/record.py", "reference_cases/pressing.py") as runs:
-        found = [one for one in runs.records(requests, said) if LEFT_OUT not in one]
+        found = [one for one in runs.records(requests, lambda _: "measured") if LEFT_OUT not in one]
     rows = [Row(**one) for one in found if "quantity" not in one]
     forces = [ForceRow(**one) for one in found if "quantity" in one]
     if rows:

@@ -56,7 +56,7 @@ def main(argv=None) -> int:
         document.add(header_text(TITLE, numbers, f"arch {numbers['arch']}"))
     else:
         asked = {name: one for name, one in VARIANTS.items() if not options.quick or one[1].name in one[0].quick}
-        rows = [Row(*one) for one in chosen(parser, options.only, asked)]
+        rows = [Row(*one) for one in chosen(parser, options.only, asked).values()]
         document, numbers = begin(TITLE, f"arch {options.arch}")
         with runs_of("hard", options, "hard_cases/*.py", "reference_cases/*.py") as runs:
             measure(rows, runs, options.arch, options.references)

@@ -4,8 +4,7 @@ A variant is solved if it ended as required and met every limit. It is in one co
 an ok end that is not allowed or that misses a limit on the answer.
 """
 
-from collections.abc import Iterator
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 
 import numpy as np
 
@@ -34,16 +33,16 @@ class Row:
     left_out: str = ""
     reference_left_out: str = ""
     error: float | None = None
-    verdicts: list[Verdict] = field(default_factory=list)
 
     @property
     def name(self) -> str:
         """Its name in VARIANTS."""
         return f"{self.case.id}: {self.variant.name}"
 
-    def judge(self) -> None:
-        """Set the verdicts."""
-        self.verdicts = [] if self.record is None else judge(self.case, self.variant, self.record)
+    @property
+    def verdicts(self) -> list[Verdict]:
+        """On its record."""
+        return [] if self.record is None else judge(self.case, self.variant, self.record)
 
     def compare(self) -> None:
         """Set the error from the points of both runs."""
@@ -97,15 +96,13 @@ class Row:
 
 
 def stored(numbers: dict) -> list[Row]:
-    """Rows of all variants from stored results, with new verdicts."""
+    """Rows of all variants from stored results."""
     known = {(row["case"], row["variant"]): row for row in numbers["rows"]}
     absent = {"run": None, "reference": None, "left_out": "not in the stored results", "reference_left_out": "", "error": None}
-    rows = []
-    for case, variant in VARIANTS.values():
-        one = known.get((case.id, variant.name), absent)
-        rows.append(Row(case, variant, one["run"], one["reference"], one["left_out"], one["reference_left_out"], one["error"]))
-        rows[-1].judge()
-    return rows
+    return [
+        Row(case, variant, *(known.get((case.id, variant.name), absent)[key] for key in absent))
+        for case, variant in VARIANTS.values()
+    ]
 
 
 def answer(request: dict) -> dict:
@@ -115,8 +112,7 @@ def answer(request: dict) -> dict:
 
 def measure(rows: list[Row], runs: Runs, arch: str, references: bool) -> None:
     """Run all rows, then their references, the cheap ones or all. Raises OutputError."""
-    for row, found in zip(rows, _records(rows, runs, arch, 1)):
-        row.record, row.left_out = (None, found[LEFT_OUT]) if LEFT_OUT in found else (found, "")
+    _run(rows, runs, arch, 1)
     finer = [
         row
         for row in rows
@@ -125,16 +121,14 @@ def measure(rows: list[Row], runs: Runs, arch: str, references: bool) -> None:
         and row.record["status"] in ANSWERED
         and (references or 2.0 * FINER * row.record["seconds"] <= CHEAP_SECONDS)
     ]
-    for row, found in zip(finer, _records(finer, runs, arch, FINER)):
-        row.reference, row.reference_left_out = (None, found[LEFT_OUT]) if LEFT_OUT in found else (found, "")
-    for row in rows:
+    _run(finer, runs, arch, FINER)
+    for row in finer:
         row.compare()
-        row.judge()
 
 
-def _records(rows: list[Row], runs: Runs, arch: str, finer: int) -> Iterator[dict]:
-    def say(request: dict, record: dict) -> str:
-        ended = record[LEFT_OUT] if LEFT_OUT in record else f"{record['status']}, {record['seconds']:.1f} s"
-        return f"{request['name']}{', reference' if finer > 1 else ''}: {ended}"
-
-    return runs.records([{"name": row.name, "arch": arch, "finer": finer} for row in rows], say)
+def _run(rows: list[Row], runs: Runs, arch: str, finer: int) -> None:
+    """Set the records of rows or of their references, or why there are none."""
+    record, left_out, what = ("record", "left_out", "") if finer == 1 else ("reference", "reference_left_out", ", reference")
+    requests = {row.name + what: {"name": row.name, "arch": arch, "finer": finer} for row in rows}
+    for row, found in zip(rows, runs.records(requests, lambda one: f"{one['status']}, {one['seconds']:.1f} s")):
+        setattr(row, left_out if LEFT_OUT in found else record, found.get(LEFT_OUT, found))

@@ -119,12 +119,6 @@ def title(record: Record) -> str:
     return record.case.title + (f", {record.job.tolerance:.0e}" if record.job.friction else "")
 
 
-def said(request: dict, found: dict) -> str:
-    """How a run ended, in a line."""
-    record = record_of(Job(**request), found)
-    return f"{title(record)}: {record.steps} steps: {record.status} {record.reason}"
-
-
 def failed(record: Record) -> bool:
     """Whether surfaces crossed, or the run ended with an error."""
     return bool(record.crossed) or record.failed
@@ -153,8 +147,9 @@ def main(argv=None) -> int:
     document, numbers = begin("Scenes of incremental potential contact", options.arch, packages=("taichi", "numpy", "ipctk"))
     document.add(__doc__.partition("\n\n")[2].partition("\n\n")[2].strip())
     with runs_of("ipc", options, "ipc*.py", "ipc_cases/*.py", "judge.py") as runs:
-        found = runs.records([asdict(job) for job in asked], said, seconds=asked[0].budget + GRACE)
-        records = [record_of(job, one) for job, one in zip(asked, found)]
+        requests, most = {name: asdict(job) for name, job in asked.items()}, max(job.budget for job in asked.values()) + GRACE
+        found = runs.records(requests, lambda one: f"{len(one['seconds'])} steps: {one['status']} {one['reason']}", most)
+        records = [record_of(job, one) for job, one in zip(asked.values(), found)]
     for text in (record_table(records), *runs.store.damaged, f"Load at the end: {load_text(load_average())}"):
         document.add(text)
     numbers |= {"friction": options.friction, "runs": [record.data() for record in records]}

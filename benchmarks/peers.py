@@ -56,11 +56,6 @@ def answer(request: dict) -> dict:
     return {"rows": [row.record() for row in measure(BY_KEY[request["work"]], programs, request["rounds"], request["arch"])]}
 
 
-def said(request: dict, found: dict) -> str:
-    """How a work ended, in a line."""
-    return f"{request['work']}: {found.get(LEFT_OUT) or str(len(found['rows'])) + ' settings'}"
-
-
 def main(argv=None) -> int:
     """Measure and print. Raises OutputError, or SimulationError where the arch is not available."""
     parser = suite_parser("peers", __doc__, f"only {' and '.join(QUICK)}, one round")
@@ -83,8 +78,8 @@ def main(argv=None) -> int:
     for name, problem in left_out.items():
         document.add(f"{name} is left out: {problem}.")
     with runs_of("peers", options, "peers.py", "exact_path.py", "programs/*.py", "works/*.py", "data/works.npz") as runs:
-        records = zip(requests, runs.records(requests, said))
-        works = [[row_of(BY_KEY[one["work"]], row) for row in found["rows"]] for one, found in records if LEFT_OUT not in found]
+        records = zip(requests, runs.records(requests, lambda found: f"{len(found['rows'])} settings"))
+        works = [[row_of(BY_KEY[key], row) for row in found["rows"]] for key, found in records if LEFT_OUT not in found]
     parts, found = page(works)
     drawn = options.out and any(rows[0].work.kind == "path" for rows in works)
     for text in (*parts, f"Load at the end: {load_text(load_average())}", *([f"![]({options.out.stem}.png)"] if drawn else [])):

@@ -70,7 +70,7 @@ def main(argv=None) -> int:
     add_arch(parser)
     add_named_out(parser)
     options = parser.parse_args(argv)
-    cases = chosen(parser, options.only, {case.name: case for case in CASES})
+    cases = list(chosen(parser, options.only, {case.name: case for case in CASES}).values())
     options.out = named_out(options, "references")
     if absent := missing(cases):
         what = ", ".join(absent) if REFERENCES.is_dir() else "the folder is missing"

@@ -131,7 +131,7 @@ def main(argv=None) -> int:
     add_only(parser)
     add_arch(parser)
     options = parser.parse_args(argv)
-    cases = chosen(parser, options.only, {case.name: case for case in CASES})
+    cases = chosen(parser, options.only, {case.name: case for case in CASES}).values()
     stored, entries, lines, changes = load(options.arch, STORE), {}, [], []
     missing = [case.name for case in cases if case.name not in stored]
     if missing and not options.update:

@@ -66,9 +66,9 @@ def suite_options(parser: argparse.ArgumentParser, argv: list[str] | None, answe
     return options
 
 
-def chosen(parser: argparse.ArgumentParser, only: Sequence[str], cases: dict[str, Case]) -> list[Case]:
+def chosen(parser: argparse.ArgumentParser, only: Sequence[str], cases: dict[str, Case]) -> dict[str, Case]:
     """The cases whose names contain a text of --only; without any it is an error of the command line."""
-    found = [case for name, case in cases.items() if any(text in name for text in only)]
+    found = {name: case for name, case in cases.items() if any(text in name for text in only)}
     if not found:
         parser.error(f"no case has {' or '.join(map(repr, only))} in its name; there are {'; '.join(cases)}")
     return found
@@ -86,19 +86,19 @@ class Runs:
     store: Store
     signals: Signals
     end: float
-    missing: list[str] = field(default_factory=list)  #: lines about requests without an answer
+    missing: list[str] = field(default_factory=list)  # requests without an answer, and why
 
-    def records(self, requests: list[dict], say: Callable[[dict, dict], str], seconds: float = math.inf) -> Iterator[dict]:
+    def records(self, requests: dict[str, dict], summary: Callable[[dict], str], seconds: float = math.inf) -> Iterator[dict]:
         """The record of each request in order; of one without an answer {LEFT_OUT, CRASHED}, and what it left UNFINISHED.
 
-        say: a line about a request and its record; seconds: that a run may take [s]. Raises OutputError.
+        requests: by name; summary: of a record, in a line; seconds: that a run may take [s]. Raises OutputError.
         """
-        for number, request in enumerate(requests, 1):
+        for number, (name, request) in enumerate(requests.items(), 1):
             key = digest([request, self.on])[:32]
             record = self.store.read(key)
             if record is None:
                 record = self._run(key, request, seconds)
-                told = say(request, record)
+                told = f"{name}: {record[LEFT_OUT] if LEFT_OUT in record else summary(record)}"
                 progress(f"{number} of {len(requests)}: {told}")
                 self.missing += [told] * (LEFT_OUT in record)
             yield record

@@ -8,7 +8,7 @@ tolerances. Errors are distances at the frames, over the largest
 excursion, to a run in double precision with small steps: 128 a frame, explicit ones 32 times the least, with tolerances of 1e-9,
 and 1e-8 of the contact laws. Implicit and explicit steps have a reference each, since quadratic elements have another mass matrix
 in explicit steps and impacts another law. A reference's own error is its distance to a run with half as many steps.
-References and errors of fixed steps are kept in the user's cache until scenes or code that runs with given steps change.
+References are kept in the user's cache until scenes or code that runs with given steps change.
 Seconds are from the call of Simulator to the end of the run, with pilots, without compiling: medians of repeated runs, in turns
 with the best fixed setting. With frames: where an observer gets them, as in `taisoft run`, so that a pilot is not the run. Best:
 the fastest fixed setting that meets the tolerance. Exit status: 0, or 1 if a limit is not met.
@@ -49,7 +49,7 @@ REPEATS, SHORT, LONG = 5, 1.0, 10.0  # runs of up to SHORT [s] are repeated; a g
 ENOUGH, SLOWEST, MEDIAN = 11 / 12, 2.0, 1.3  # of the scenes that meet a tolerance; times over the best fixed setting
 QUICK = ("hanging beam", "incline")
 HERE = Path(__file__).parent
-SOURCES = (HERE / "error_cases.py", HERE / "reference_cases" / "record.py")  # on which stored runs depend
+SOURCES = (HERE / "error_cases.py", HERE / "reference_cases" / "record.py")  # on which stored references depend
 NOT_RUNNING = (*NOT_COMPUTING, "estimation")  # folders of taisoft on which they do not
 
 
@@ -96,24 +96,17 @@ def read_row(data: dict) -> Row:
     return Row(**data | {"best": data["best"] and Fixed(**data["best"])})
 
 
-class Stored:
-    """Arrays of runs with given steps in a folder, by default of the user's cache; none are kept if it cannot be used."""
-
-    def __init__(self, folder: Path | None = None):
-        self._on = [machine() | {"load": None}, code_digest(NOT_RUNNING), files_digest(SOURCES)]
-        self._store = Store()
-        with suppress(StopIteration, OutputError):
-            self._store = Store((folder or next(cache_folders())) / "tolerance")
-
-    def get(self, request: list, compute: Callable[[], np.ndarray]) -> np.ndarray:
-        """The array of a request, plain data, or what `compute` returns, which is then stored."""
-        key = digest([request, self._on])[:32]
-        found = self._store.read(key)
-        if found is None:
-            found = {"array": compute()}
-            with suppress(OutputError):  # the folder is full
-                self._store.write(key, found)
-        return found["array"]
+def stored(request: list, compute: Callable[[], np.ndarray]) -> np.ndarray:
+    """The array of a request, plain data, from the user's cache, or what `compute` returns, which is then kept there."""
+    key = digest([request, machine() | {"load": None}, code_digest(NOT_RUNNING), files_digest(SOURCES)])[:32]
+    store = Store()
+    with suppress(StopIteration, OutputError):  # no folder can be used
+        store = Store(next(cache_folders()) / "tolerance")
+    if (found := store.read(key)) is None:
+        found = {"array": compute()}
+        with suppress(OutputError):  # the folder is full
+            store.write(key, found)
+    return found["array"]
 
 
 def fps_of(case: Case) -> float:
@@ -122,53 +115,38 @@ def fps_of(case: Case) -> float:
 
 
 class Scene:
-    """The references of a scene, and its frame. least: explicit steps a frame; stored: runs before this one."""
+    """The references of a scene, and its frame. least: explicit steps a frame."""
 
-    def __init__(self, case: Case, stored: Stored):
-        self.case, self.frame, self._stored = case, 1.0 / fps_of(case), stored
+    def __init__(self, case: Case):
+        self.case, self.frame = case, 1.0 / fps_of(case)
         with ts.Simulator(case.build(), dt=1e-9, integrator="velocity_verlet") as sim:
             self.least, self.touches = stable_steps(sim.stable_dt, self.frame), sim.touches
-        self._truths: dict[bool, np.ndarray] = {}
+        self._truths: dict[tuple, np.ndarray] = {}
 
     def path(self, integrator: str, steps: int, **settings) -> np.ndarray:
         """Positions (k,n,3) [m] at the frames."""
         scene, dt = self.case.build(), self.frame / steps
         return path_of(scene, dt, integrator, self.case.seconds, 1.0 / self.frame, **settings)[0]
 
-    def truth(self, explicit: bool) -> np.ndarray:
-        """Path of the reference."""
-        if explicit not in self._truths:
-            self._truths[explicit] = self._reference(explicit, 1)
-        return self._truths[explicit]
-
-    def own_error(self, explicit: bool) -> float:
-        """Error of the reference."""
-
-        def find() -> np.ndarray:
-            truth = self.truth(explicit)
-            return np.array(distance(self._reference(explicit, 2), truth, largest_excursion(truth)).max)
-
-        return float(self._stored.get([self.case.name, "own error", explicit, TRUTH[explicit]], find))
-
-    def _reference(self, explicit: bool, larger: int) -> np.ndarray:
+    def truth(self, explicit: bool, larger: int = 1) -> np.ndarray:
         """Path of the reference, or with steps larger by a factor."""
         integrator = "velocity_verlet" if explicit else "bdf2" if self.touches else "implicit_midpoint"
         settings = {"precision": "f64"} if explicit else {"precision": "f64", "newton_tolerance": EXACT["newton_tolerance"]}
         settings |= {"contact_tolerance": EXACT["contact_tolerance"]} if self.touches else {}
         steps = TRUTH[explicit] * (self.least if explicit else 1) // larger
-        request = [self.case.name, "path", integrator, steps, settings]
-        return self._stored.get(request, lambda: self.path(integrator, steps, **settings))
+        if (integrator, steps) not in self._truths:
+            request = [self.case.name, integrator, steps, settings]
+            self._truths[integrator, steps] = stored(request, lambda: self.path(integrator, steps, **settings))
+        return self._truths[integrator, steps]
+
+    def distance(self, path: np.ndarray, explicit: bool) -> float:
+        """Error of a path; infinite if it is shorter, that of a run that failed."""
+        truth = self.truth(explicit)
+        return distance(path, truth, largest_excursion(truth)).max if len(path) == len(truth) else math.inf
 
     def error(self, integrator: str, steps: int, **settings) -> float:
-        """True error of a run with fixed steps; infinite if it fails."""
-
-        def find() -> np.ndarray:
-            path, truth = self.path(integrator, steps, **settings), self.truth(explicit)
-            whole = len(path) == len(truth)  # a failed run is shorter
-            return np.array(distance(path, truth, largest_excursion(truth)).max if whole else math.inf)
-
-        explicit = integrator in EXPLICIT
-        return float(self._stored.get([self.case.name, "error", integrator, steps, settings, TRUTH[explicit]], find))
+        """True error of a run with fixed steps."""
+        return self.distance(self.path(integrator, steps, **settings), integrator in EXPLICIT)
 
     def timed(self, *settings: dict) -> tuple[list[float], list[ts.RunReport], ts.Simulator]:
         """Median seconds of set-up and run with each of several settings, in turns, without compiling; their last reports, and
@@ -222,7 +200,7 @@ class Scene:
             status=report.status,
             estimated=report.error_estimate.time if report.error_estimate else None,
             true=self.error(integrator, steps, **tolerances) if report.status != "failed" else math.inf,
-            own=self.own_error(integrator in EXPLICIT),
+            own=self.distance(self.truth(integrator in EXPLICIT, 2), integrator in EXPLICIT),
             seconds=seconds[-1],
             observed=seconds[-2],
             pilots=report.pilot_seconds,
@@ -269,15 +247,10 @@ def find_limits(rows: list[Row]) -> list[Limit]:
 def answer(request: dict) -> dict:
     """In a child: the rows of a scene, and its grid."""
     with without_warnings():
-        scene = Scene(next(case for case in CASES if case.name == request["name"]), Stored())
+        scene = Scene(next(case for case in CASES if case.name == request["name"]))
         grid = scene.grid()
         rows = [asdict(scene.row(wish, grid)) for wish in request["wishes"]]
     return {"rows": rows, "grid": [asdict(one) for one in grid]}
-
-
-def said(request: dict, found: dict) -> str:
-    """How a scene ended, in a line."""
-    return f"{request['name']}: {found.get(LEFT_OUT) or str(len(found['grid'])) + ' fixed settings'}"
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -294,11 +267,10 @@ def main(argv: list[str] | None = None) -> int:
     options.out = named_out(options, "tolerance")
     document, numbers = begin("Runs to a tolerance", "cpu", "f32")
     with runs_of("tolerance", options, "error_cases.py", "tolerance.py", "reference_cases/record.py") as runs:
-        found = {one["name"]: answer for one, answer in zip(requests, runs.records(requests, said)) if LEFT_OUT not in answer}
-    rows, grids = (
-        [read_row(row) for one in found.values() for row in one["rows"]],
-        {name: one["grid"] for name, one in found.items()},
-    )
+        records = runs.records(requests, lambda one: f"{len(one['grid'])} fixed settings")
+        found = {name: one for name, one in zip(requests, records) if LEFT_OUT not in one}
+    rows = [read_row(row) for one in found.values() for row in one["rows"]]
+    grids = {name: one["grid"] for name, one in found.items()}
     document.add(row_table(rows))
     return runs.finish(document, options, numbers | {"precision": "f32", "rows": rows, "grids": grids}, find_limits(rows))
 

@@ -17,7 +17,6 @@ import math
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -202,7 +201,7 @@ def tolerance_small(patch, folder):
     """Without limits on times, which other processes on the machine may lengthen."""
     patch.setattr(ts, "Simulator", ModelSimulator)
     replace(patch, tolerance, MEDIAN=math.inf, SLOWEST=math.inf)
-    replace(patch, tolerance, Stored=partial(tolerance.Stored, folder))
+    replace(patch, tolerance, cache_folders=lambda: iter([folder]))
     answer_here(patch, tolerance.answer)
 
 

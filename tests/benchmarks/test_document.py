@@ -21,7 +21,6 @@ from benchmarks import document, figures, manual, report, tolerance
 from benchmarks.document import Limit, agrees, crossovers, exponent
 from benchmarks.manual import BLOCK, TABLES, filled, newest, pages
 from benchmarks.report_parts.page import AGREE, DISAGREE, MISSING, PARTLY, Claim, Part, small_png, verdict_of
-from benchmarks.tolerance import Stored
 from taisoft.cli.scene_file import shipped_files
 from taisoft.errors import OutputError
 from taisoft.machine import summarise
@@ -87,8 +86,10 @@ def test_bad_options_are_refused_before_measuring(tmp_path, capsys):
 
 def test_arrays_are_stored_until_the_code_changes(tmp_path, monkeypatch):
     def get(value: float, request: int = 1) -> float:
-        return float(Stored(tmp_path).get(["request", request], lambda: np.array(value)))
+        return float(tolerance.stored(["request", request], lambda: np.array(value)))
 
+    monkeypatch.setattr(tolerance, "cache_folders", lambda: iter([folder]))
+    folder = tmp_path
     assert [get(1.0), get(2.0), get(3.0, request=2)] == [1.0, 1.0, 3.0]
     for file in tmp_path.rglob("*.json"):
         file.write_bytes(b"damaged")
@@ -96,7 +97,8 @@ def test_arrays_are_stored_until_the_code_changes(tmp_path, monkeypatch):
     monkeypatch.setattr(tolerance, "code_digest", lambda _: "other")
     assert get(6.0) == 6.0
     (tmp_path / "file").touch()
-    assert float(Stored(tmp_path / "file").get([], lambda: np.array(7.0))) == 7.0
+    folder = tmp_path / "file"
+    assert get(7.0, request=3) == 7.0
 
 
 def test_figures_come_from_every_benchmark(tmp_path, monkeypatch, capsys):
