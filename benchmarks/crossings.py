@@ -30,7 +30,6 @@ from taisoft.machine import require
 
 from .crossing_runs import DEMOS, DISTANCE_EVERY, GROUPS, HARD, HEAPS, JITTERED, NEAR, SHOTS, answer, names_of
 from .document import begin, table
-from .runner import named_out
 from .suite import CRASHED, LEFT_OUT, chosen, runs_of, suite_options, suite_parser
 
 TITLE = "Crossings"
@@ -157,7 +156,6 @@ def main(argv=None) -> int:
     options = suite_options(parser, argv, answer)
     require("ipctk", "taisoft bench crossings", "dev")
     requests = chosen(parser, options.only, asked(options))
-    options.out = named_out(options, "crossings")
     document, numbers = begin(TITLE, f"arch {options.arch}", packages=("taichi", "numpy", "ipctk"))
     with runs_of("crossings", options, *FILES) as runs:
         found = zip(requests.items(), runs.records(requests, summary))

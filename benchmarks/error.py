@@ -26,7 +26,7 @@ from taisoft.scene.refine import refined
 from .document import Limit, begin, table
 from .error_cases import CASES, CONTACT, SMOOTH, Case, estimate_columns, path_of
 from .error_quantities import FORCES, Force, ForceRow, force_limits, force_row, force_table
-from .runner import named_out, without_warnings
+from .runner import without_warnings
 from .suite import LEFT_OUT, chosen, runs_of, suite_options, suite_parser
 
 STEPS_A_FRAME = 4  # of implicit runs: twins with four times the step then meet every frame
@@ -172,10 +172,9 @@ def answer(request: dict) -> dict:
 
 def main(argv: list[str] | None = None) -> int:
     """Measure and print. Raises OutputError if a file cannot be written."""
-    parser = suite_parser("error", __doc__, f"only {' and '.join(QUICK)}", arch=False)
-    options = suite_options(parser, argv, answer)
+    parser = suite_parser("error", __doc__, f"only {' and '.join(QUICK)}")
+    options = suite_options(parser, argv, answer, arch=False)
     requests = chosen(parser, options.only, {name: {"name": name} for name in (QUICK if options.quick else EVERY)})
-    options.out = named_out(options, "error")
     document, numbers = begin("Estimated against true errors", options.arch, "f32")
     with runs_of("error", options, "error*.py", "reference_cases/record.py", "reference_cases/pressing.py") as runs:
         found = [one for one in runs.records(requests, lambda _: "measured") if LEFT_OUT not in one]

@@ -21,25 +21,11 @@ from taisoft.output.files import make_folder
 from .document import RESULTS, default_out, load_text, table
 from .runner import make_parser, progress
 
-# name -> output: a page with numbers (json), a picture (png), or a folder of both (folder)
-WRITES = {
-    "references": ("json",),
-    "elasticity": ("json",),
-    "collision": ("json",),
-    "contact": ("json",),
-    "order": ("json", "png"),
-    "scaling": ("json", "png"),
-    "peers": ("json",),
-    "hard": ("json",),
-    "report": ("folder",),
-    "startup": ("json",),
-    "launches": ("json",),
-    "gym": ("json",),
-    "laws": ("json",),
-    "pictures": ("json",),
-    "window": ("json",),
-}
-OPTIONS = {"json": ("--out", ".json"), "png": ("--plot", ".png"), "folder": ("--out", "")}
+BENCHMARKS = (
+    *("references", "elasticity", "collision", "contact", "order", "scaling", "peers", "hard", "report", "startup", "launches"),
+    *("gym", "laws", "pictures", "window"),
+)
+ENDINGS = {"order": (".json", ".png"), "scaling": (".json", ".png"), "report": ("",)}  # of files; a folder has none; else .json
 NO_QUICK = ("references",)
 
 
@@ -55,9 +41,10 @@ class Outcome:
 
 def command(name: str, quick: bool, results: Path) -> list[str]:
     """Command line of a benchmark, with files named after the machine."""
-    outputs = [(option, default_out("cpu", name, suffix)) for option, suffix in (OPTIONS[kind] for kind in WRITES[name])]
-    files = [part for option, path in outputs for part in (option, str(results / path.name))]
-    return [sys.executable, "-m", "taisoft", "bench", name, *(["--quick"] if quick and name not in NO_QUICK else []), *files]
+    made = [sys.executable, "-m", "taisoft", "bench", name, *(["--quick"] if quick and name not in NO_QUICK else [])]
+    for ending in ENDINGS.get(name, (".json",)):
+        made += ["--plot" if ending == ".png" else "--out", str(results / default_out("cpu", name, ending).name)]
+    return made
 
 
 def make(names: Iterable[str], quick: bool, results: Path, logs: Path) -> list[Outcome]:
@@ -77,7 +64,9 @@ def make(names: Iterable[str], quick: bool, results: Path, logs: Path) -> list[O
 def main(argv=None) -> int:
     """Run the benchmarks. Raises OutputError."""
     parser = make_parser("figures", __doc__)
-    parser.add_argument("--only", action="append", choices=WRITES, metavar="NAME", help=f"one of {', '.join(WRITES)}; repeatable")
+    parser.add_argument(
+        "--only", action="append", choices=BENCHMARKS, metavar="NAME", help=f"one of {', '.join(BENCHMARKS)}; repeatable"
+    )
     parser.add_argument("--quick", action="store_true", help="small cases; give --results too, the manual takes no quick ones")
     parser.add_argument("--results", type=Path, default=RESULTS, metavar="DIR", help="default benchmarks/results")
     parser.add_argument("--logs", type=Path, default=Path("out/figures"), metavar="DIR", help="default out/figures")
@@ -85,7 +74,7 @@ def main(argv=None) -> int:
     if options.quick and options.results == RESULTS:
         parser.error("--quick needs --results: benchmarks/results holds whole results only")
     results, logs = make_folder(options.results).resolve(), make_folder(options.logs)
-    ended = make(options.only or WRITES, options.quick, results, logs)
+    ended = make(options.only or BENCHMARKS, options.quick, results, logs)
     if results == RESULTS:
         done = subprocess.run([sys.executable, "-m", "taisoft", "bench", "manual"], stdin=subprocess.DEVNULL, check=False)
         ended.append(Outcome("manual", done.returncode, 0.0, load_average()))

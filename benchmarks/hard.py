@@ -21,11 +21,10 @@ from pathlib import Path
 
 from taisoft.errors import OutputError
 
-from .document import Document, begin, header_text
+from .document import Document, begin, check_out, header_text
 from .hard_cases import VARIANTS
 from .hard_runs import Row, answer, measure, stored
 from .hard_table import page
-from .runner import named_out
 from .suite import chosen, runs_of, suite_options, suite_parser
 
 TITLE = "Hard cases"
@@ -48,11 +47,9 @@ def main(argv=None) -> int:
     if options.judge is not None:
         if options != argparse.Namespace(**vars(parser.parse_args([])) | {"judge": options.judge}):
             parser.error("--judge goes alone")
-        options.out = options.judge
-    options.out = named_out(options, "hard")
-    if options.judge is not None:
-        numbers = stored_numbers(options.judge)
-        rows, document, damaged = stored(numbers), Document(), []
+        check_out(options.judge, ".json")
+        options.out, numbers, document, damaged = options.judge, stored_numbers(options.judge), Document(), []
+        rows = stored(numbers)
         document.add(header_text(TITLE, numbers, f"arch {numbers['arch']}"))
     else:
         asked = {name: one for name, one in VARIANTS.items() if not options.quick or one[1].name in one[0].quick}

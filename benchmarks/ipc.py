@@ -28,11 +28,11 @@ from .ipc_cases import NAMES
 from .ipc_cases.case import FULL, SIZES, SMALL
 from .ipc_friction import STEPS, TOLERANCES
 from .ipc_runs import GRACE, SKIPPED, Job, Record, answer, mean, record_of
-from .runner import named_out
 from .suite import chosen, runs_of, suite_options, suite_parser
 
 BUDGET, QUICK_BUDGET, QUICK_STEPS = 3600.0, 60.0, 3  # [s], [s], steps
 TOLERANCE = 1e-4
+FRICTION = "ipc_friction"  # name of the results with friction
 
 
 def jobs(options: argparse.Namespace) -> dict[str, Job]:
@@ -41,7 +41,7 @@ def jobs(options: argparse.Namespace) -> dict[str, Job]:
     budget = options.seconds if options.seconds is not None else (QUICK_BUDGET if options.quick else BUDGET)
     steps = options.steps or (QUICK_STEPS if options.quick else None)
     common = {"size": size, "budget": budget, "precision": options.precision, "arch": options.arch}
-    if not options.friction:
+    if options.results != FRICTION:
         return {name: Job(name, tolerance=options.tolerance, steps=steps, **common) for name in NAMES}
     return {
         f"{name}, tolerance {tolerance:g}": Job(name, tolerance=tolerance, steps=steps or own, friction=True, **common)
@@ -130,7 +130,8 @@ def parser() -> argparse.ArgumentParser:
     made.add_argument("--size", choices=SIZES, help="of the meshes (default full, with --quick small)")
     made.add_argument("--seconds", type=float, metavar="SECONDS", help=f"wall time of each scene (default {BUDGET:g})")
     made.add_argument("--steps", type=int, metavar="N", help="at most so many steps of each scene")
-    made.add_argument("--friction", action="store_true", help="the table of friction instead")
+    text = "the table of friction instead"
+    made.add_argument("--friction", dest="results", action="store_const", const=FRICTION, default="ipc", help=text)
     made.add_argument("--precision", choices=("f32", "f64"), default="f64", help="(default %(default)s)")
     text = "newton_tolerance and contact_tolerance (default %(default)g)"
     made.add_argument("--tolerance", type=float, default=TOLERANCE, metavar="NUMBER", help=text)
@@ -143,7 +144,6 @@ def main(argv=None) -> int:
     options = suite_options(made, argv, answer)
     require("ipctk", "taisoft bench ipc", "dev")
     asked = chosen(made, options.only, jobs(options))
-    options.out = named_out(options, "ipc_friction" if options.friction else "ipc")
     document, numbers = begin("Scenes of incremental potential contact", options.arch, packages=("taichi", "numpy", "ipctk"))
     document.add(__doc__.partition("\n\n")[2].partition("\n\n")[2].strip())
     with runs_of("ipc", options, "ipc*.py", "ipc_cases/*.py", "judge.py") as runs:
@@ -152,7 +152,7 @@ def main(argv=None) -> int:
         records = [record_of(job, one) for job, one in zip(asked.values(), found)]
     for text in (record_table(records), *runs.store.damaged, f"Load at the end: {load_text(load_average())}"):
         document.add(text)
-    numbers |= {"friction": options.friction, "runs": [record.data() for record in records]}
+    numbers |= {"friction": options.results == FRICTION, "runs": [record.data() for record in records]}
     return document.finish(options, numbers) or int(any(map(failed, records)))
 
 

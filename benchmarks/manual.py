@@ -65,9 +65,8 @@ def measured_on(numbers: dict, *more: str) -> str:
     return f"\n\nMeasured on: {'; '.join([where, *more])}."
 
 
-def order_errors(results: Path) -> str:
+def order_errors(numbers: dict) -> str:
     """Errors of the hanging beam by order and mesh, with four and with fourteen quadrature points."""
-    numbers = newest(results, "order")
     exact = numbers["references"][HANGING]["values"][0]
     rows = [row for row in numbers["rows"] if row["case"] == HANGING and row["measured"]]
 
@@ -86,9 +85,8 @@ def order_errors(results: Path) -> str:
     return table([row for row in rows if row["degree"] == DEFAULT_DEGREE[row["order"]]], columns)
 
 
-def order_times(results: Path) -> str:
+def order_times(numbers: dict) -> str:
     """Times to 1 % error of both orders, for the cases in which both reach it."""
-    numbers = newest(results, "order")
     titles = {row["case"]: f"{row['case']}, {row['law']}" for row in numbers["rows"]}
     lines = []
     for c in numbers["comparisons"]:
@@ -99,9 +97,8 @@ def order_times(results: Path) -> str:
     return markdown(("case", "linear [s]", "quadratic [s]", "speed-up"), lines, left=(0,)) + measured_on(numbers)
 
 
-def peers(results: Path) -> str:
+def peers(numbers: dict) -> str:
     """taisoft and other programs at equal error, without the stiff beams."""
-    numbers = newest(results, "peers")
     found = {"mujoco-core": numbers["versions"].get("mujoco")} | numbers["versions"]  # packages of MuJoCo to 4.0.0 and from 4.0.1
     programs = "MuJoCo {}, PyBullet {}, Newton {}".format(*(found[name] for name in ("mujoco-core", "pybullet", "newton")))
     shown = [one for one in numbers["comparisons"] if not one["stiff"]]
@@ -112,9 +109,8 @@ WORKS = {"W1": "beam that hangs from its end", "W2": "cube dropped on the ground
 WORKS |= {"W4": "cube dropped on a clamped sheet"}
 
 
-def peers_short(results: Path) -> str:
+def peers_short(numbers: dict) -> str:
     """The same for the README: a row for each pair of settings, at the smallest error that both meet."""
-    numbers = newest(results, "peers")
     lines: dict[tuple, tuple] = {}
     for one in numbers["comparisons"]:
         (own, own_seconds), (other, seconds) = one["taisoft"], one["others"]
@@ -127,9 +123,8 @@ def peers_short(results: Path) -> str:
     return markdown(headings, lines.values(), left=(0, 4)) + measured_on(numbers)
 
 
-def collision(results: Path) -> str:
+def collision(numbers: dict) -> str:
     """Whole searches for contacts by scene, with proximity and with distance fields."""
-    numbers = newest(results, "collision")
     rows = {(row["setup"], row["geometry"]): row for row in numbers["scenes"] + numbers["piles"] if not row["failure"]}
     lines = []
     for (setup, geometry), row in rows.items():
@@ -141,9 +136,8 @@ def collision(results: Path) -> str:
     return markdown(headings, lines, left=(0,)) + measured_on(numbers)
 
 
-def scaling(results: Path) -> str:
+def scaling(numbers: dict) -> str:
     """Time and memory per tet on the smallest and largest mesh, and the exponent of the time."""
-    numbers = newest(results, "scaling")
     lines = []
     for growth in numbers["exponents"]:
         own = sorted((r for r in numbers["rows"] if r["kind"] == growth["kind"] and r["samples"]), key=lambda r: r["tets"])
@@ -157,15 +151,13 @@ def scaling(results: Path) -> str:
     return markdown(headings, lines, left=(0,)) + measured_on(numbers)
 
 
-def pictures(results: Path) -> str:
+def pictures(numbers: dict) -> str:
     """Times of a picture, and of runs without and with pictures."""
-    numbers = newest(results, "pictures")
     return f"{picture_table(numbers['picture'])}\n\n{picture_runs(numbers['runs'])}{measured_on(numbers)}"
 
 
-def hard(results: Path) -> str:
+def hard(numbers: dict) -> str:
     """The hard cases: how many variants are solved, how they ended, and why the others are not solved."""
-    numbers = newest(results, "hard")
     rows = stored(numbers)
     shown = shown_columns(rows)
 
@@ -190,9 +182,8 @@ IPC_WORK = (  # columns of both tables of incremental potential contact
 )
 
 
-def ipc(results: Path) -> str:
+def ipc(numbers: dict) -> str:
     """How far the scenes of incremental potential contact came, and their seconds a step beside the published ones."""
-    numbers = newest(results, "ipc")
     records = [Record.read(run) for run in numbers["runs"]]
     columns = (
         ("<scene", lambda r: r.case.title),
@@ -209,9 +200,8 @@ def ipc(results: Path) -> str:
     return table(records, columns) + measured_on(numbers, "f64", f"at most {budget:g} s a scene")
 
 
-def crossings(results: Path) -> str:
+def crossings(numbers: dict) -> str:
     """States judged, states that cross and shots that tunnelled, by group of runs."""
-    numbers = newest(results, "crossings")
     groups: dict[str, list[dict]] = {}
     for row in numbers["rows"]:
         groups.setdefault(row["group"], []).append(row)
@@ -226,9 +216,8 @@ def crossings(results: Path) -> str:
     return table(list(groups), columns) + measured_on(numbers)
 
 
-def ipc_friction(results: Path) -> str:
+def ipc_friction(numbers: dict) -> str:
     """How well friction holds in four scenes at three tolerances."""
-    numbers = newest(results, "ipc_friction")
     records = [Record.read(run) for run in numbers["runs"]]
     columns = (
         ("<scene", lambda r: r.case.title),
@@ -242,57 +231,59 @@ def ipc_friction(results: Path) -> str:
     return table(records, columns) + measured_on(numbers, "f64")
 
 
-def error(results: Path) -> str:
+def error(numbers: dict) -> str:
     """Estimated errors over true ones."""
-    numbers = newest(results, "error")
     rows = [ErrorRow(**row) for row in numbers["rows"]]
     return row_table(rows) + measured_on(numbers)
 
 
-def tolerance(results: Path) -> str:
+def tolerance(numbers: dict) -> str:
     """Wished, estimated and true errors."""
-    numbers = newest(results, "tolerance")
     return tolerance_table([read_row(row) for row in numbers["rows"]]) + measured_on(numbers)
 
 
-def window(results: Path) -> str:
+def window(numbers: dict) -> str:
     """Speed, pictures per second and latency of drags in the live window."""
-    numbers = newest(results, "window")
     return window_table(numbers["rows"]) + measured_on(numbers)
 
 
-def window_keys(_results: Path) -> str:
+def window_keys(_: dict) -> str:
     """Keys and mouse buttons of the live window, from its own table."""
     rows = [*MOUSE, *((key.label, key.text) for key in KEYS)]
     return markdown(("key or button", "action"), rows, left=(0, 1))
 
 
-def gpu(results: Path) -> str:
+def gpu(numbers: dict) -> str:
     """Sizes, works and sweeps on a GPU, as far as they were measured."""
-    numbers = newest(results, "cuda_check")
     found = {part["part"]: part["found"] for part in numbers["parts"]}
     tables = [GPU_TABLES[name](found[name]) for name in ("sizes", "works", "sweeps", "reruns") if found.get(name)]
     return "\n\n".join(tables) + measured_on(numbers, numbers["gpu"])
 
 
-TABLES: dict[str, Callable[[Path], str]] = {  # by marker
-    "order_errors": order_errors,
-    "order_times": order_times,
-    "peers": peers,
-    "peers_short": peers_short,
-    "scaling": scaling,
-    "collision": collision,
-    "hard": hard,
-    "ipc": ipc,
-    "ipc_friction": ipc_friction,
-    "error": error,
-    "tolerance": tolerance,
-    "crossings": crossings,
-    "pictures": pictures,
-    "window": window,
-    "window_keys": window_keys,
-    "gpu": gpu,
+TABLES: dict[str, tuple[str, Callable[[dict], str]]] = {  # by marker: the benchmark with the numbers, or none, and the text
+    "order_errors": ("order", order_errors),
+    "order_times": ("order", order_times),
+    "peers": ("peers", peers),
+    "peers_short": ("peers", peers_short),
+    "scaling": ("scaling", scaling),
+    "collision": ("collision", collision),
+    "hard": ("hard", hard),
+    "ipc": ("ipc", ipc),
+    "ipc_friction": ("ipc_friction", ipc_friction),
+    "error": ("error", error),
+    "tolerance": ("tolerance", tolerance),
+    "crossings": ("crossings", crossings),
+    "pictures": ("pictures", pictures),
+    "window": ("window", window),
+    "window_keys": ("", window_keys),
+    "gpu": ("cuda_check", gpu),
 }
+
+
+def made(name: str, results: Path = RESULTS) -> str:
+    """The text at a marker. Raises OutputError."""
+    benchmark, text = TABLES[name]
+    return text(newest(results, benchmark) if benchmark else {})
 
 
 def filled(text: str, results: Path = RESULTS) -> str:
@@ -305,7 +296,7 @@ def filled(text: str, results: Path = RESULTS) -> str:
     unknown = [name for name in whole if name not in TABLES]
     if unknown:
         raise OutputError(f"the marker '{unknown[0]}' is unknown; there are {', '.join(TABLES)}")
-    return BLOCK.sub(lambda m: f"{m[1]}\n{TABLES[m[2]](results)}\n\n{m[3]}", text)
+    return BLOCK.sub(lambda m: f"{m[1]}\n{made(m[2], results)}\n\n{m[3]}", text)
 
 
 def pages() -> list[Path]:
@@ -325,14 +316,14 @@ def main(argv=None) -> int:
     differing = 0
     for page in pages():
         text = page.read_text(encoding="utf-8")
-        made = filled(text)
-        if made == text:
+        renewed = filled(text)
+        if renewed == text:
             print(f"{page.name} agrees with the results")
         elif options.check:
             print(f"{page.name} differs from the results: `taisoft bench manual` rewrites it")
             differing += 1
         else:
-            write_bytes(page, made.encode())
+            write_bytes(page, renewed.encode())
             print(f"written: {page}")
     return 1 if differing else 0
 

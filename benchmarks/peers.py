@@ -23,7 +23,6 @@ from taisoft.output.tables import require_matplotlib
 
 from .document import begin, limit_table, load_text
 from .programs import mujoco_flex, newton_works, own, pybullet_soft
-from .runner import named_out
 from .suite import LEFT_OUT, chosen, runs_of, suite_options, suite_parser
 from .works.runs import Row, measure, row_of
 from .works.scenes import WORKS
@@ -69,7 +68,6 @@ def main(argv=None) -> int:
     settings = {"programs": [name for name in wanted if name not in left_out], "rounds": 1 if options.quick else options.rounds}
     asked = {key: {"work": key, "arch": options.arch} | settings for key in (QUICK if options.quick else BY_KEY)}
     requests = chosen(parser, options.only, asked)
-    options.out = named_out(options, "peers")
     if options.out is not None:
         require_matplotlib("--out")
     packages = ("taichi", "mujoco-core", "pybullet", "newton", "warp-lang", "numpy")

@@ -20,7 +20,7 @@ from taisoft.backend.runtime import open_runtime
 from .document import begin, table
 from .reference_cases import CASES
 from .reference_cases.record import Case, computed
-from .runner import add_arch, add_named_out, make_parser, named_out, progress
+from .runner import make_parser, parse_options, progress
 from .suite import add_only, chosen
 
 REFERENCES = Path(__file__).resolve().parents[1].parent / "shared" / "references"
@@ -67,11 +67,8 @@ def main(argv=None) -> int:
     """Run the cases and print their table. Raises OutputError, or SimulationError if the arch is not available."""
     parser = make_parser("references", __doc__)
     add_only(parser)
-    add_arch(parser)
-    add_named_out(parser)
-    options = parser.parse_args(argv)
+    options = parse_options(parser, argv)
     cases = list(chosen(parser, options.only, {case.name: case for case in CASES}).values())
-    options.out = named_out(options, "references")
     if absent := missing(cases):
         what = ", ".join(absent) if REFERENCES.is_dir() else "the folder is missing"
         print(f"taisoft bench references: reference values are absent from {REFERENCES}: {what}", file=sys.stderr)

@@ -45,9 +45,9 @@ def add_arch(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--arch", choices=("cpu", "cuda"), default="cpu", help="where to compute (default cpu)")
 
 
-def add_named_out(parser: argparse.ArgumentParser, files: str = "FILE.json and FILE.md") -> None:
+def add_named_out(parser: argparse.ArgumentParser) -> None:
     """Add --out [FILE.json]; without a name, `named_out` puts the file into benchmarks/results."""
-    text = f"write {files}; without a name into benchmarks/results, named after the machine"
+    text = "write FILE.json and FILE.md; without a name into benchmarks/results, named after the machine"
     parser.add_argument("--out", type=Path, nargs="?", const=RESULTS, metavar="FILE.json", help=text)
 
 
@@ -58,29 +58,33 @@ def named_out(options: argparse.Namespace, name: str) -> Path | None:
     return out
 
 
-def quick_options(name: str, doc: str, argv: list[str] | None, quick: str) -> argparse.Namespace:
-    """Parse --quick and --out [FILE.json] of a benchmark on the CPU. quick: help of --quick. Raises OutputError."""
-    parser = make_parser(name, doc)
-    parser.add_argument("--quick", action="store_true", help=quick)
-    add_named_out(parser)
+def parse_options(
+    parser: argparse.ArgumentParser, argv: list[str] | None, drawn: str = "", arch: bool = True
+) -> argparse.Namespace:
+    """Add --out [FILE.json], --arch unless it is always cpu, and --plot if something is drawn; parse.
+
+    An option `results` may say what results without a name are named after, if not after the benchmark. Raises OutputError if a
+    file cannot be written.
+    """
     parser.set_defaults(arch="cpu")
-    options = parser.parse_args(argv)
-    options.out = named_out(options, name)
-    return options
-
-
-def parse_options(parser: argparse.ArgumentParser, argv: list[str] | None, drawn: str = "") -> argparse.Namespace:
-    """Add --arch, --out and, if something is drawn, --plot; parse, and check that the files can be written."""
-    add_arch(parser)
-    parser.add_argument("--out", type=Path, metavar="FILE.json", help="write FILE.json and FILE.md too")
+    if arch:
+        add_arch(parser)
+    add_named_out(parser)
     if drawn:
         parser.add_argument("--plot", type=Path, metavar="FILE.png", help=f"draw {drawn}")
     options = parser.parse_args(argv)
-    check_out(options.out, ".json")
+    options.out = named_out(options, getattr(options, "results", parser.prog.split()[-1]))
     if drawn and options.plot:
         check_out(options.plot, ".png")
         require_matplotlib()
     return options
+
+
+def quick_options(name: str, doc: str, argv: list[str] | None, quick: str) -> argparse.Namespace:
+    """Parse --quick and --out [FILE.json] of a benchmark on the CPU. quick: help of --quick. Raises OutputError."""
+    parser = make_parser(name, doc)
+    parser.add_argument("--quick", action="store_true", help=quick)
+    return parse_options(parser, argv, arch=False)
 
 
 def progress(text: str) -> None:

@@ -24,7 +24,7 @@ from taisoft.nested import from_json, to_json
 from taisoft.output.files import FolderLock, make_folder
 
 from .document import Document, Limit
-from .runner import add_arch, add_named_out, files_digest, make_parser, progress
+from .runner import files_digest, make_parser, parse_options, progress
 
 Case = TypeVar("Case")
 UNFINISHED = "unfinished"  # entry of a request: file in which a child leaves what it has so far; of a record: what it left
@@ -43,24 +43,22 @@ def add_only(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--only", nargs="+", default=[""], metavar="NAME", help=text)
 
 
-def suite_parser(name: str, doc: str, quick: str, arch: bool = True) -> argparse.ArgumentParser:
-    """Parser with --only, --quick, --budget, --keep and --out. quick: help of --quick; arch: whether with --arch, else cpu."""
+def suite_parser(name: str, doc: str, quick: str) -> argparse.ArgumentParser:
+    """Parser with --only, --quick, --budget and --keep. quick: help of --quick."""
     parser = make_parser(name, doc)
-    parser.set_defaults(arch="cpu")
     add_only(parser)
     parser.add_argument("--quick", action="store_true", help=quick)
-    if arch:
-        add_arch(parser)
     parser.add_argument("--budget", type=float, default=math.inf, metavar="SECONDS", help="start no run after this time")
     parser.add_argument("--keep", type=Path, metavar="DIR", help="store finished runs there, and reuse those stored")
-    add_named_out(parser)
     parser.add_argument("--child", action="store_true", help=argparse.SUPPRESS)  # how `Runs` calls the benchmark again
     return parser
 
 
-def suite_options(parser: argparse.ArgumentParser, argv: list[str] | None, answer: Callable[[dict], dict]) -> argparse.Namespace:
-    """The options of a suite; in a child of `Runs` instead answer its request, and end."""
-    options = parser.parse_args(argv)
+def suite_options(
+    parser: argparse.ArgumentParser, argv: list[str] | None, answer: Callable[[dict], dict], arch: bool = True
+) -> argparse.Namespace:
+    """The options of a suite, see `parse_options`; in a child of `Runs` instead answer its request, and end."""
+    options = parse_options(parser, argv, arch=arch)
     if options.child:
         serve(lambda request: {"answer": answer(request)})
     return options

@@ -38,7 +38,7 @@ from taisoft.many.store import NOT_COMPUTING, Store, code_digest, digest
 from .document import Limit, begin, table
 from .error import EXACT, EXPLICIT_FPS
 from .error_cases import CASES, Case, path_of
-from .runner import files_digest, named_out, without_warnings
+from .runner import files_digest, without_warnings
 from .suite import LEFT_OUT, chosen, runs_of, suite_options, suite_parser
 
 TOLERANCES = (0.1, 0.01, 0.001)
@@ -255,16 +255,15 @@ def answer(request: dict) -> dict:
 
 def main(argv: list[str] | None = None) -> int:
     """Measure and print. Raises OutputError if a file cannot be written."""
-    parser = suite_parser("tolerance", __doc__, f"only {' and '.join(QUICK)}", arch=False)
+    parser = suite_parser("tolerance", __doc__, f"only {' and '.join(QUICK)}")
     known = {f"{100.0 * one:g}": one for one in TOLERANCES}
     parser.add_argument(
         "--wish", nargs="+", choices=known, default=list(known), metavar="PERCENT", help=f"only these: {', '.join(known)}"
     )
-    options = suite_options(parser, argv, answer)
+    options = suite_options(parser, argv, answer, arch=False)
     wishes = [known[text] for text in options.wish]
     names = QUICK if options.quick else [case.name for case in CASES]
     requests = chosen(parser, options.only, {name: {"name": name, "wishes": wishes} for name in names})
-    options.out = named_out(options, "tolerance")
     document, numbers = begin("Runs to a tolerance", "cpu", "f32")
     with runs_of("tolerance", options, "error_cases.py", "tolerance.py", "reference_cases/record.py") as runs:
         records = runs.records(requests, lambda one: f"{len(one['grid'])} fixed settings")

@@ -202,12 +202,6 @@ C3.add_limit(
 )
 for quantity, largest in (("sideways deviation [m]", 1e-3), ("hop [m]", 1e-3), ("loss of speed", 0.01)):
     C3.add_limit(quantity, largest, PROPOSED, part="inner edges")
-C3.add_shortfall(
-    "rounding: in 5 steps of 400 the contact laws stop at a residual of 3e-4 to 8e-4, where 1e-4 is asked; with f64 all "
-    "steps converge, to 1e-6",
-    "a floor for the rounding of the contact residual, as the equations of motion have one, or that residual in f64",
-    part="spike",
-)
 
 TOUCHES = Must(OK, "where several contact normals are equally right, each of them gives an answer")
 C4 = Case("C4", "features that meet exactly", aligned, size=0.1, quick=("corner",))

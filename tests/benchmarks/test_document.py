@@ -112,8 +112,8 @@ def test_figures_come_from_every_benchmark(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(subprocess, "run", run)
     folders = ["--results", str(tmp_path), "--logs", str(tmp_path / "logs")]
     assert figures.main(folders) == 1
-    assert [command[4] for command in commands] == list(figures.WRITES)
-    assert set(figures.WRITES) <= set(shipped_files("benchmarks"))
+    assert [command[4] for command in commands] == list(figures.BENCHMARKS)
+    assert set(figures.BENCHMARKS) <= set(shipped_files("benchmarks"))
     files = [part for command in commands for part in command if part.startswith(str(tmp_path))]
     assert len(set(files)) == len(files) >= len(commands) and "| collision  |           1 |" in capsys.readouterr().out
     commands.clear()
@@ -144,7 +144,7 @@ def test_the_newest_full_results_are_used(tmp_path):
 
 
 def test_marked_parts_of_pages_are_replaced(monkeypatch, tmp_path, capsys):
-    monkeypatch.setitem(TABLES, "fake", lambda results: "made")
+    monkeypatch.setitem(TABLES, "fake", ("", lambda _: "made"))
     monkeypatch.setattr(manual, "DOCS", tmp_path)
     page = tmp_path / "page.md"
     page.write_text("no table")
