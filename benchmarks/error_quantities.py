@@ -9,6 +9,7 @@ the run with TRUTH times the steps on the same mesh; of the solvers, to one with
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 
@@ -105,21 +106,6 @@ def pushed(n: int) -> ts.Scene:
     return scene
 
 
-def rough(n: int) -> ts.Scene:
-    """The ball on a plane with friction 0.5."""
-    return ball(n, friction=0.5)
-
-
-def quadratic(n: int) -> ts.Scene:
-    """The ball of quadratic tets on a smooth plane."""
-    return ball(n, order=2)
-
-
-def on_block(n: int) -> ts.Scene:
-    """The ball on a block, without friction."""
-    return ball(n, block=True)
-
-
 F_Y, F_X = "contact_force.y ball", "contact_force.x ball"
 # References of the whole ball: axisymmetric elements, normal force and sum of the radial friction. A quarter has the fourth part
 # of the former, and 1/(2 pi) of the latter along x. The block: plane-strain elements, T/N = 0.2946 of N = 4e4 N/m. The ball on
@@ -127,17 +113,17 @@ F_Y, F_X = "contact_force.y ball", "contact_force.x ball"
 FORCES = (
     Force("ball", ball, 1, (8, 16), F_Y, 4361.2 / 4),
     Force("ball", ball, 1, (16, 8), F_Y, 4361.2 / 4),
-    Force("quadratic ball", quadratic, 1, (4, 8), F_Y, 4361.2 / 4),
-    Force("quadratic ball", quadratic, 1, (8, 4), F_Y, 4361.2 / 4),
-    Force("rough ball", rough, 1, (8, 16), F_Y, 4501.3 / 4),
-    Force("rough ball", rough, 1, (16, 8), F_Y, 4501.3 / 4),
-    Force("rough ball", rough, 1, (8, 16), F_X, 1337.8 / (2.0 * math.pi)),
-    Force("rough ball", rough, 1, (16, 8), F_X, 1337.8 / (2.0 * math.pi)),
-    Force("rough ball", rough, 1, (12, 24), F_X, 1337.8 / (2.0 * math.pi)),
+    Force("quadratic ball", partial(ball, order=2), 1, (4, 8), F_Y, 4361.2 / 4),
+    Force("quadratic ball", partial(ball, order=2), 1, (8, 4), F_Y, 4361.2 / 4),
+    Force("rough ball", partial(ball, friction=0.5), 1, (8, 16), F_Y, 4501.3 / 4),
+    Force("rough ball", partial(ball, friction=0.5), 1, (16, 8), F_Y, 4501.3 / 4),
+    Force("rough ball", partial(ball, friction=0.5), 1, (8, 16), F_X, 1337.8 / (2.0 * math.pi)),
+    Force("rough ball", partial(ball, friction=0.5), 1, (16, 8), F_X, 1337.8 / (2.0 * math.pi)),
+    Force("rough ball", partial(ball, friction=0.5), 1, (12, 24), F_X, 1337.8 / (2.0 * math.pi)),
     Force("pushed block", pushed, 6, (20, 40), "contact_force.x block", -0.2946 * 4e4 * 0.2),
     Force("pushed block", pushed, 6, (40, 20), "contact_force.x block", -0.2946 * 4e4 * 0.2),
-    Force("ball on block", on_block, 1, (8, 16), F_Y, 6304.0 / 4),
-    Force("ball on block", on_block, 1, (16, 8), F_Y, 6304.0 / 4),
+    Force("ball on block", partial(ball, block=True), 1, (8, 16), F_Y, 6304.0 / 4),
+    Force("ball on block", partial(ball, block=True), 1, (16, 8), F_Y, 6304.0 / 4),
 )
 
 

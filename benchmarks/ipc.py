@@ -152,7 +152,7 @@ def main(argv=None) -> int:
         records = [record_of(job, one) for job, one in zip(asked.values(), found)]
     for text in (record_table(records), *runs.store.damaged, f"Load at the end: {load_text(load_average())}"):
         document.add(text)
-    numbers |= {"friction": options.results == FRICTION, "runs": [record.data() for record in records]}
+    numbers |= {"friction": options.results == FRICTION, "runs": records}
     return document.finish(options, numbers) or int(any(map(failed, records)))
 
 

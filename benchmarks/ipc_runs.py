@@ -49,7 +49,7 @@ class Job:
 class Record:
     """What a run did, as plain data. failed: whether it ended with an error.
 
-    least_distance: [m], every DISTANCE_EVERY steps; math.inf if nothing was nearer than NEAR of an edge. crossed: number of steps
+    least_distance: [m], every DISTANCE_EVERY steps; None if nothing was nearer than NEAR of an edge. crossed: number of steps
     after which surfaces crossed. newton, cg, substeps: of each step. seconds: of each step without compilation [s].
     creep [1/s], friction_work [J], cut (steps in substeps): see `ipc_friction`; None and 0 unless it is measured.
     """
@@ -64,7 +64,7 @@ class Record:
     substeps: list[int] = field(default_factory=list)
     seconds: list[float] = field(default_factory=list)
     compile_seconds: float = 0.0
-    least_distance: float = math.inf
+    least_distance: float | None = None
     crossed: int = 0
     first_crossed: float | None = None
     unconverged: int = 0
@@ -115,16 +115,10 @@ class Record:
         self.status = STOPPED if why else DEGRADED if self.faults else OK
         self.reason = "; ".join([*([why] if why else []), *self.faults])
 
-    def data(self) -> dict:
-        """The record as plain data; an infinite distance becomes None."""
-        known = self.least_distance if math.isfinite(self.least_distance) else None
-        return asdict(self) | {"least_distance": known}
-
     @classmethod
     def read(cls, data: dict) -> "Record":
-        """The record of plain data."""
-        least = math.inf if data["least_distance"] is None else data["least_distance"]
-        return cls(**data | {"job": Job(**data["job"]), "least_distance": least})
+        """The record of plain data, that of `asdict`."""
+        return cls(**data | {"job": Job(**data["job"])})
 
 
 def run(job: Job, report=lambda record: None) -> Record:
@@ -175,8 +169,8 @@ def _advance(sim: ts.Simulator, case: Case, job: Job, record: Record, report) ->
             record.crossed += 1
             record.first_crossed = sim.time if record.first_crossed is None else record.first_crossed
         if record.steps % DISTANCE_EVERY == 1:
-            found = judge.least_distance(near)
-            record.least_distance = min(record.least_distance, found if found < near else math.inf)
+            distances = (record.least_distance, judge.least_distance(near))
+            record.least_distance = min([one for one in distances if one is not None and one < near], default=None)
         now = time.monotonic()
         if record.crossed and case.stop_at_crossing:
             return record.end(f"surfaces cross at t = {sim.time:.3g} s")
@@ -191,7 +185,7 @@ def _advance(sim: ts.Simulator, case: Case, job: Job, record: Record, report) ->
 def answer(request: dict) -> dict:
     """In a child: the record of a job, which it leaves from time to time."""
     job = Job(**{key: value for key, value in request.items() if key != UNFINISHED})
-    return run(job, lambda record: leave(request, record.data())).data()
+    return asdict(run(job, lambda record: leave(request, asdict(record))))
 
 
 def record_of(job: Job, found: dict) -> Record:

@@ -28,10 +28,7 @@ from .runner import files_digest, make_parser, parse_options, progress
 
 Case = TypeVar("Case")
 UNFINISHED = "unfinished"  # entry of a request: file in which a child leaves what it has so far; of a record: what it left
-LEFT_OUT, CRASHED = (
-    "left_out",
-    "crashed",
-)  # entries of a record of a request without an answer: why, and whether its process failed
+LEFT_OUT, CRASHED = "left_out", "crashed"  # entries of a record without an answer: why, and whether the process failed
 
 
 # --- options ------------------------------------------------------------------------------------------------------------

@@ -1,6 +1,7 @@
 """What takes the place of measurements and simulators in tests of benchmarks."""
 
 from collections.abc import Callable
+from dataclasses import asdict
 from types import SimpleNamespace
 from typing import Any
 
@@ -75,7 +76,7 @@ def answer_here(patch: pytest.MonkeyPatch, answer: Callable[[dict], dict]) -> No
 
 def ipc_answer(request: dict) -> dict:
     """What a child of `taisoft bench ipc` answers."""
-    return ipc_record(ipc_runs.Job(**{key: value for key, value in request.items() if key != suite.UNFINISHED})).data()
+    return asdict(ipc_record(ipc_runs.Job(**{key: value for key, value in request.items() if key != suite.UNFINISHED})))
 
 
 def ipc_record(job=None, **more) -> ipc_runs.Record:
