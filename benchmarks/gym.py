@@ -29,7 +29,7 @@ from taisoft.errors import TaisoftError
 from .document import Document, Limit, begin, table
 from .exact_path import SAMPLE
 from .programs import mujoco_flex, own
-from .programs.session import Setting
+from .programs.session import Setting, problem
 from .runner import patched, progress, quick_options, without_warnings
 from .works.evaluation import evaluate
 from .works.references import MUJOCO, TAISOFT
@@ -254,7 +254,7 @@ def add_works(document: Document, rows: list[dict], left_out: str) -> None:
 def main(argv=None) -> int:
     """Measure and print. Exit status: 0, or 1 if a limit is not met (not with --quick). Raises OutputError."""
     options = quick_options("gym", __doc__, argv, "few steps, two processes, W1 alone, no limits")
-    quick, left_out = options.quick, mujoco_flex.problem()
+    quick, left_out = options.quick, problem(mujoco_flex)
     document, numbers = begin("What an episode costs", "arch cpu", packages=("taichi", "gymnasium", "mujoco-core", "numpy"))
     costs = {}
     for name in INTEGRATORS:

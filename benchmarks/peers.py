@@ -23,6 +23,7 @@ from taisoft.output.tables import require_matplotlib
 
 from .document import begin, limit_table, load_text
 from .programs import mujoco_flex, newton_works, own, pybullet_soft
+from .programs.session import problem
 from .suite import LEFT_OUT, chosen, runs_of, suite_options, suite_parser
 from .works.runs import Row, measure, row_of
 from .works.scenes import WORKS
@@ -64,7 +65,7 @@ def main(argv=None) -> int:
     parser.add_argument("--rounds", type=int, default=ROUNDS, help="rounds over all settings (default %(default)s)")
     options = suite_options(parser, argv, answer)
     wanted = {name: one for name, one in PROGRAMS.items() if one is own or not options.program or name in options.program}
-    left_out = {name: problem for name, program in wanted.items() if (problem := program.problem())}
+    left_out = {name: why for name, program in wanted.items() if (why := problem(program))}
     settings = {"programs": [name for name in wanted if name not in left_out], "rounds": 1 if options.quick else options.rounds}
     asked = {key: {"work": key, "arch": options.arch} | settings for key in (QUICK if options.quick else BY_KEY)}
     requests = chosen(parser, options.only, asked)
@@ -73,8 +74,8 @@ def main(argv=None) -> int:
     packages = ("taichi", "mujoco-core", "pybullet", "newton", "warp-lang", "numpy")
     document, numbers = begin("Speed against error, beside other programs", f"arch {options.arch}", packages=packages)
     document.add(__doc__.partition("\n\n")[2].partition("\n\n")[2].strip())
-    for name, problem in left_out.items():
-        document.add(f"{name} is left out: {problem}.")
+    for name, why in left_out.items():
+        document.add(f"{name} is left out: {why}.")
     with runs_of("peers", options, "peers.py", "exact_path.py", "programs/*.py", "works/*.py", "data/works.npz") as runs:
         records = zip(requests, runs.records(requests, lambda found: f"{len(found['rows'])} settings"))
         works = [[row_of(BY_KEY[key], row) for row in found["rows"]] for key, found in records if LEFT_OUT not in found]

@@ -27,6 +27,7 @@ import warnings
 import numpy as np
 
 from taisoft.errors import SimulationError
+from taisoft.machine import require
 
 from ..exact_path import POISSON, SAMPLE
 from ..works.references import MUJOCO, NEWTON, Model, masses
@@ -59,27 +60,15 @@ INERTIA = 0  # the warning of a nearly singular matrix, harmless for thin flexes
 FALSE_ALARM = "flex '.*' is not rigid and has no equality constraints or passive forces"  # it counts no elasticity
 
 
-def import_mujoco():
+def load():
     """The package. Raises SimulationError where it is absent or too old."""
-    try:
-        import mujoco
-    except ImportError:
-        raise SimulationError("the comparison with MuJoCo needs the package mujoco-core, version 4.0.1 or later") from None
+    mujoco = require("mujoco", "the comparison with MuJoCo", "peers", SimulationError)
     if tuple(int(part) for part in mujoco.__version__.split(".")[:3]) < (4, 0, 1):
         raise SimulationError(
             f"mujoco {mujoco.__version__} solves by a wrong Hessian, or doubles the first Lamé parameter of a 3D flex: "
             "version 4.0.1 of mujoco-core or later is needed"
         )
     return mujoco
-
-
-def problem() -> str:
-    """Why it is not available."""
-    try:
-        import_mujoco()
-    except SimulationError as error:
-        return str(error)
-    return ""
 
 
 def settings(work: Work, arch: str = "cpu") -> list[Setting]:
@@ -128,7 +117,7 @@ class Run(Session):
     """Degrees of freedom 3 i, 3 i + 1, 3 i + 2 of `model` are x, y, z of the i-th free node."""
 
     def build(self) -> None:
-        self.mujoco = mujoco = import_mujoco()
+        self.mujoco = mujoco = load()
         work, options = self.work, self.setting.options
         spec = mujoco.MjSpec()
         self._set_options(spec)

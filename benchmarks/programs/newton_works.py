@@ -13,6 +13,8 @@
 import numpy as np
 
 import taisoft as ts
+from taisoft.errors import SimulationError
+from taisoft.machine import require
 
 from ..exact_path import DENSITY, POISSON
 from ..works.references import NEWTON, TAISOFT, masses
@@ -29,23 +31,11 @@ GROUND = ("stiffness", "damping", "slope", "radius")
 ON_GROUND = ((8, 5e4, 10.0, 20.0, 3e-3), (12, 7e4, 10.0, 30.0, 3e-3), (16, 1e5, 20.0, 40.0, 3e-3), (32, 2e5, 120.0, 100.0, 1e-3))
 
 
-def problem() -> str:
-    """Why it is not available."""
-    try:
-        _import_newton()
-    except ImportError:
-        return "the comparison with Newton needs the package newton"
-    return ""
-
-
-def _import_newton():
-    """Import Newton and Warp, without a log line per compiled module."""
-    import warp
-
+def load():
+    """Newton and Warp, without a log line per compiled module. Raises SimulationError where they are absent."""
+    warp = require("warp", "the comparison with Newton", "peers", SimulationError)
     warp.config.log_level = warp.LOG_WARNING
-    import newton
-
-    return newton, warp
+    return require("newton", "the comparison with Newton", "peers", SimulationError), warp
 
 
 def settings(work: Work, arch: str = "cpu") -> list[Setting]:
@@ -72,7 +62,7 @@ class Run(Session):
     """`build` captures the launches of one SAMPLE as a graph."""
 
     def build(self) -> None:
-        newton, self.warp = _import_newton()
+        newton, self.warp = load()
         work, setting = self.work, self.setting
         self.explicit = setting.method == "semi_implicit"
         builder = newton.ModelBuilder(up_axis=newton.Axis.Y, gravity=(0.0, -work.gravity, 0.0))

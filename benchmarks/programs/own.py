@@ -19,9 +19,9 @@ IMPLICIT = ("bdf2", "implicit_midpoint", "implicit_euler")
 FINER = (1, 2, 4, 11)  # explicit steps of W1: errors of second order down to 1e-5; the last in f64 too
 
 
-def problem() -> str:
-    """taisoft is always available."""
-    return ""
+def load():
+    """The package."""
+    return ts
 
 
 def make_scene(work: Work, model: Model = TAISOFT) -> Scene:

@@ -15,6 +15,7 @@ import numpy as np
 
 import taisoft as ts
 from taisoft.errors import SimulationError
+from taisoft.machine import require
 
 from ..exact_path import DENSITY, POISSON
 from ..works.references import PYBULLET
@@ -25,14 +26,10 @@ NAME, MODEL = "PyBullet", PYBULLET
 MARGIN = 1e-3  # m
 
 
-def problem() -> str:
-    """Why it is not available."""
-    try:
-        with _silent():
-            import pybullet  # noqa: F401
-    except ImportError:
-        return "the comparison with PyBullet needs the package pybullet"
-    return ""
+def load():
+    """The package. Raises SimulationError where it is absent."""
+    with _silent():
+        return require("pybullet", "the comparison with PyBullet", "peers", SimulationError)
 
 
 def settings(work: Work, arch: str = "cpu") -> list[Setting]:
@@ -49,10 +46,9 @@ class Run(Session):
     """Each reset rebuilds the world."""
 
     def build(self) -> None:
+        self.bullet = load()
         with _silent():
-            import pybullet
-
-            self.bullet, self.here = pybullet, {"physicsClientId": pybullet.connect(pybullet.DIRECT)}
+            self.here = {"physicsClientId": self.bullet.connect(self.bullet.DIRECT)}
             self.reset()
 
     def reset(self) -> None:

@@ -1,11 +1,12 @@
 """Interface of the compared programs: settings for a work, and a run with one of them.
 
-A program is a module with NAME, MODEL (see works.references), `problem()` (why it is not available, or ""), `settings(work,
-arch)` (a list of Setting) and `Run`, a Session. Positions are those of all nodes of a work, body after body.
+A program is a module with NAME, MODEL (see works.references), `load()` (its package; raises SimulationError without it),
+`settings(work, arch)` (a list of Setting) and `Run`, a Session. Positions are those of all nodes of a work, body after body.
 """
 
 from dataclasses import dataclass, field
 from time import perf_counter
+from types import ModuleType
 
 import numpy as np
 
@@ -14,6 +15,15 @@ from taisoft.errors import SimulationError
 from ..exact_path import SAMPLE
 from ..works.references import Model
 from ..works.scenes import Work
+
+
+def problem(program: ModuleType) -> str:
+    """Why a program is not available, or "" if it is."""
+    try:
+        program.load()
+    except SimulationError as error:
+        return str(error)
+    return ""
 
 
 @dataclass(frozen=True)
