@@ -27,6 +27,7 @@ from .document import Document, Limit
 from .runner import files_digest, make_parser, parse_options, progress
 
 Case = TypeVar("Case")
+SHOWN = 30  # names of cases in a message
 UNFINISHED = "unfinished"  # entry of a request: file in which a child leaves what it has so far; of a record: what it left
 LEFT_OUT, CRASHED = "left_out", "crashed"  # entries of a record without an answer: why, and whether the process failed
 
@@ -65,7 +66,8 @@ def chosen(parser: argparse.ArgumentParser, only: Sequence[str], cases: dict[str
     """The cases whose names contain a text of --only; without any it is an error of the command line."""
     found = {name: case for name, case in cases.items() if any(text in name for text in only)}
     if not found:
-        parser.error(f"no case has {' or '.join(map(repr, only))} in its name; there are {'; '.join(cases)}")
+        known = "; ".join(list(cases)[:SHOWN]) + ("; ..." if len(cases) > SHOWN else "")
+        parser.error(f"no case has {' or '.join(map(repr, only))} in its name; there are {known}")
     return found
 
 
