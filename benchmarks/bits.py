@@ -29,9 +29,10 @@ from taisoft.cli import Signals
 from taisoft.errors import SceneError, SimulationError
 from taisoft.files import write_bytes
 from taisoft.machine import machine, usable_cores
-from taisoft.many.places import LocalPlace, carry_out, serve
+from taisoft.many.places import LocalPlace, carry_out
 from taisoft.nested import from_json, to_json
 from taisoft.output.tables import markdown
+from taisoft.processes import serve
 
 from .bits_cases import Case, all_cases
 from .document import check_out, header

@@ -18,10 +18,11 @@ from typing import TypeVar
 from taisoft.cli import Signals
 from taisoft.files import write_bytes
 from taisoft.machine import machine, usable_cores
-from taisoft.many.places import LocalPlace, carry_out, serve
+from taisoft.many.places import LocalPlace, carry_out
 from taisoft.many.store import Store, code_digest, digest
 from taisoft.nested import from_json, to_json
 from taisoft.output.files import FolderLock, make_folder
+from taisoft.processes import serve
 
 from .document import Document, Limit
 from .runner import files_digest, make_parser, parse_options, progress

@@ -16,10 +16,11 @@ from taisoft.cli.scene_file import check_scene_solver, find_scene, load_scene
 from taisoft.errors import SceneError, TaisoftError, reworded
 from taisoft.machine import usable_cores
 from taisoft.many.cluster import cluster_places, connect
-from taisoft.many.places import LocalPlace, serve
+from taisoft.many.places import LocalPlace
 from taisoft.many.store import Store, code_digest, digests, sources
 from taisoft.output.files import FolderLock, check_free, make_folder
 from taisoft.output.report import machine
+from taisoft.processes import serve
 from taisoft.scene import checks
 from taisoft.scene.checks import check_solver
 from taisoft.study import AXES, Request, mesh_name

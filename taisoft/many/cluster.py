@@ -5,7 +5,6 @@ user's files under the same names, which each request's child checks. Dask sends
 a trusted network.
 """
 
-import threading
 import time
 import uuid
 from contextlib import suppress
@@ -24,22 +23,19 @@ class ClusterPlace:
 
     def __init__(self, client, address: str, cores: list[int], child: tuple[str, ...], threads: int | None = None):
         self.cores, self.threads, self._client, self._address = cores, threads, client, address
-        self._local, self._name = (cores, child, threads), ""
-        self._future, self._last_check = None, 0.0
+        self._local, self._name, self._future = (cores, child, threads), uuid.uuid4().hex, None
 
-    def start(self, request: dict) -> None:
+    def execute(self, request: dict) -> dict:
         """See Place."""
-        self._name = self._name or uuid.uuid4().hex
         there = {"workers": [self._address], "allow_other_workers": False, "pure": False, "retries": 0}
-        self._future = self._client.submit(run_on_worker, request, self._name, self._local, **there)
-
-    def poll(self) -> dict | None:
-        """See Place."""
-        if self._future is None:
-            return None
-        if not self._future.done():
-            return self._check_alive()
-        future, self._future = self._future, None
+        future = self._future = self._client.submit(run_on_worker, request, self._name, self._local, **there)
+        checked = time.monotonic()
+        while not future.done():
+            time.sleep(POLL_INTERVAL)
+            if time.monotonic() - checked > ALIVE_CHECK_INTERVAL:
+                if why := self._lost():
+                    return {"lost": why}
+                checked = time.monotonic()
         if future.status == "finished":
             return future.result()
         if future.status == "error":
@@ -48,50 +44,33 @@ class ClusterPlace:
 
     def stop(self) -> None:
         """See Place. Dask cannot stop a running task, so a second task stops it on the worker."""
-        if self._name:
+        if self._future is not None:
             with suppress(Exception):  # Dask may raise anything if worker or scheduler are gone; nothing is then left to stop
                 self._client.run(stop_on_worker, self._name, workers=[self._address], on_error="ignore")
-                if self._future is not None:
-                    self._future.cancel()
-            self._future, self._name = None, ""
+                self._future.cancel()
+            self._future = None
 
-    def _check_alive(self) -> dict | None:
-        """Check periodically that the worker is alive, because Dask keeps a task waiting for a lost worker."""
-        if time.monotonic() - self._last_check < ALIVE_CHECK_INTERVAL:
-            return None
-        self._last_check = time.monotonic()
+    def _lost(self) -> str:
+        """Return why nothing can be expected of the worker, or "": Dask keeps a task waiting for a lost worker."""
         try:
             alive = self._address in self._client.scheduler_info(n_workers=-1)["workers"]
         except Exception as error:  # Dask and Tornado have their own exception types
-            return {"lost": f"the scheduler does not answer ({type(error).__name__})"}
-        if alive:
-            return None
-        self._future = None
-        return {"lost": f"the worker {self._address} is gone"}
+            return f"the scheduler does not answer ({type(error).__name__})"
+        return "" if alive else f"the worker {self._address} is gone"
 
 
 _places: dict[str, LocalPlace] = {}  # on a worker: its places, by name
-_lock = threading.Lock()
 
 
 def run_on_worker(request: dict, name: str, local: tuple) -> dict:
     """Execute a request on a cluster's worker, in its place of this name, which LocalPlace(*local) makes."""
-    with _lock:
-        place = _places.setdefault(name, LocalPlace(*local))
-        place.start(request)
-    while True:
-        with _lock:
-            answer = place.poll() if name in _places else {"crash": "it was stopped"}
-        if answer is not None:
-            return answer
-        time.sleep(POLL_INTERVAL)
+    return _places.setdefault(name, LocalPlace(*local)).execute(request)
 
 
 def stop_on_worker(name: str) -> None:
     """Stop the place of that name."""
-    with _lock:
-        if place := _places.pop(name, None):
-            place.stop()
+    if place := _places.pop(name, None):
+        place.stop()
 
 
 def _worker_info() -> dict:

@@ -20,8 +20,8 @@ from pathlib import Path
 import numpy as np
 
 from taisoft.errors import SceneError, collected_warnings, value_text
-from taisoft.many.places import serve
 from taisoft.many.store import code_digest, digest, sources
+from taisoft.processes import serve
 from taisoft.records import RunReport
 
 STATUSES = ("ok", "degraded", "failed")  # from the best to the worst

@@ -15,10 +15,10 @@ from pathlib import Path
 
 import numpy as np
 
+from taisoft import processes
 from taisoft.errors import OutputError, SceneError, value_text
 from taisoft.files import write_bytes
 from taisoft.machine import THREADS, thread_count, usable_cores
-from taisoft.many import places
 from taisoft.many.cluster import cluster_places, connect
 from taisoft.many.make import COLUMNS, Make, make_of
 from taisoft.many.places import LocalPlace, Place, carry_out
@@ -56,7 +56,7 @@ def run_many(
     again by the next call. Values do not depend on workers, threads, order or what else ran in a process. Ctrl-C keeps what is
     finished and raises KeyboardInterrupt. Raises SceneError for invalid arguments, OutputError if `out` cannot be used.
     """
-    if places.serving:
+    if processes.serving:
         rule = "in a script, call it under `if __name__ == '__main__':`, which they leave out"
         raise SceneError(f"run_many was called in one of its own processes: {rule}")
     function, given = make_of(make), _checked(make, parameters)

@@ -1,17 +1,14 @@
 """Read files that may be broken: their bytes and lines, and any format by meshio in a child process.
 
 On a broken file meshio may end the program, print, raise any exception, loop forever, or allocate far more memory than the file
-can fill; the mesher fTetWild prints a lot and may end its process. So both run in a child process, meshio with bounded time and
-memory. What it finds comes back as JSON (`taisoft.nested`). The child imports neither Taichi nor SciPy and starts in about 0.2 s.
+can fill; the mesher fTetWild prints a lot and may end its process. So both run in a child (`taisoft.processes`), meshio with
+bounded time and memory. It imports neither Taichi nor SciPy and starts in about 0.2 s.
 """
 
 import builtins
 import contextlib
-import functools
 import io
 import re
-import subprocess
-import sys
 import tempfile
 from codecs import BOM_UTF8
 from collections.abc import Callable
@@ -22,8 +19,7 @@ import numpy as np
 
 from taisoft.errors import MeshError, one_line
 from taisoft.mesh.fibres import FIBRES
-from taisoft.nested import from_json, to_json
-from taisoft.processes import start_python
+from taisoft.processes import call, serve
 
 UTF16 = "the file is UTF-16 text; save it as UTF-8"
 HEAD = 64  # characters inspected to detect UTF-16 text
@@ -91,14 +87,13 @@ def content_lines(name: str, data: bytes) -> list[tuple[int, list[str]]]:
 
 def read_by_meshio(file: Path, data: bytes) -> FileContent:
     """Return what a file holds. data: its bytes. Raises MeshError for every failure of meshio."""
-    seconds = SECONDS + SECONDS_PER_BYTE * len(data)
     with tempfile.TemporaryDirectory(prefix="taisoft-") as folder:
-        source = file.absolute()
+        source = file
         if not data.startswith(b"<") and file.stat().st_size != len(data):  # only XML readers accept a byte-order mark
             source = Path(folder, file.name)
             source.write_bytes(data)
         try:
-            found = run_child(folder, "read", str(source), str(seconds), seconds=WALL_FACTOR * seconds)
+            found = read_in_child("meshio", source)
         except MeshError as error:
             place, text = re.match(r"((?:line|byte) \d+: )?(.*)", str(error)).groups()
             raise MeshError(f"{file}: {place or ''}not a supported mesh ({text})") from None
@@ -123,45 +118,44 @@ def content_of(mesh) -> FileContent:
     return FileContent(np.asarray(mesh.points), cells, numbers, names, fibres=fibres)
 
 
-def run_child(folder: str, task: str, *arguments: str, seconds: float | None = None) -> dict:
-    """Run a task of `main` in a child process inside a folder; return what it writes to result.json there.
-
-    Raises MeshError with the last line that the child prints if it fails or takes more than `seconds`.
-    """
-    streams = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE, "cwd": folder, "start_new_session": False}
-    child = start_python("-P", "-m", __name__, task, *arguments, environment={"OPENBLAS_NUM_THREADS": "1"}, **streams)
-    with child:
-        try:
-            printed = child.communicate(timeout=seconds)[1].decode("utf-8", "replace").strip()
-        except subprocess.TimeoutExpired:
-            raise MeshError(f"its reader was stopped after {seconds:.0f} s") from None
-        finally:  # do not leave the process running after a signal
-            child.kill()
-    result = Path(folder, "result.json")
-    if child.returncode != 0 or not result.is_file():
-        raise MeshError(one_line(printed.rsplit("\n", 1)[-1]) or f"exit status {child.returncode}")
-    return from_json(result.read_bytes())
+def read_in_child(task: str, file: Path, **given) -> dict:
+    """Return what a task of `TASKS` reads from a file, with bounded time and memory. Raises MeshError."""
+    size = file.stat().st_size
+    seconds = SECONDS + SECONDS_PER_BYTE * size
+    limits = {"memory": MEMORY + MEMORY_PER_BYTE * size, "seconds": int(seconds) + 1}
+    return run_child(task, WALL_FACTOR * seconds, path=str(file.absolute()), limits=limits, **given)
 
 
-def main(task: str, *arguments: str) -> None:
-    """Run a task in the child process: "read" a file by meshio, "usd" or "lone_usd": a stage, "mesh" surface.npz by fTetWild."""
-    Path("result.json").write_text(to_json(TASKS[task](*arguments), level=0))
+def run_child(task: str, seconds: float | None = None, **given) -> dict:
+    """Return what a task of `TASKS` returns in a child process. Raises MeshError, also if it takes more than `seconds`."""
+    request, environment = {"task": task, "given": given}, {"OPENBLAS_NUM_THREADS": "1"}
+    with tempfile.TemporaryDirectory(prefix="taisoft-") as folder:  # the mesher writes files where it runs
+        answer = call(("-P", "-m", __name__), request, seconds, environment=environment, cwd=folder)
+    if "answer" not in answer:
+        raise MeshError(answer.get("error") or one_line(answer["crash"]))
+    return answer["answer"]
 
 
-def _read_usd(path: str, seconds: str, alone: bool = False) -> dict:
+def answer(request: dict) -> dict:
+    """Carry out a task in the child."""
+    try:
+        return {"answer": TASKS[request["task"]](**request["given"])}
+    except MeshError as error:
+        return {"error": str(error)}
+
+
+def _read_usd(path: str, limits: dict, alone: bool) -> dict:
     from taisoft.mesh.usd_content import read_stage
 
-    _limit_resources(MEMORY + MEMORY_PER_BYTE * Path(path).stat().st_size, int(float(seconds)) + 1)
+    _limit_resources(**limits)
     return read_stage(path, alone)
 
 
-def _mesh() -> dict[str, np.ndarray]:
+def _fill(vertices: np.ndarray, triangles: np.ndarray, edge_length: float, envelope: float) -> dict[str, np.ndarray]:
     import wildmeshing
 
-    with np.load("surface.npz", allow_pickle=False) as surface:
-        vertices, triangles, (length, envelope) = surface["vertices"], surface["triangles"], surface["numbers"]
     mesher = wildmeshing.Tetrahedralizer(
-        stop_quality=QUALITY, max_its=MAX_ITERATIONS, edge_length_r=float(length), epsilon=float(envelope)
+        stop_quality=QUALITY, max_its=MAX_ITERATIONS, edge_length_r=edge_length, epsilon=envelope
     )
     mesher.set_log_level(6)
     mesher.set_mesh(vertices, triangles.astype(np.int32))
@@ -170,12 +164,12 @@ def _mesh() -> dict[str, np.ndarray]:
     return {"vertices": np.asarray(points, dtype=np.float64), "tets": np.asarray(tets, dtype=np.int64)}
 
 
-def _read(path: str, seconds: str) -> dict:
-    """Read a file by meshio; exit with one line that says why it failed, without repeating the file: it may be confidential."""
+def _read(path: str, limits: dict) -> dict:
+    """Read a file by meshio. Raises MeshError, which says why without repeating the file: it may be confidential."""
     import meshio
 
     data = Path(path).read_bytes()
-    _limit_resources(MEMORY + MEMORY_PER_BYTE * len(data), int(float(seconds)) + 1)
+    _limit_resources(**limits)
     builtins.open = _open_bounded
     printed: list[str] = []  # the printer would parse file content as markup, which may fail
     meshio._common.Console.print = lambda _, text, **__: printed.append(re.sub(r"\[/?\w+\]|Warning: ", "", str(text)))
@@ -190,15 +184,15 @@ def _read(path: str, seconds: str) -> dict:
         if sum(array.size for array in (*arrays, *of_cells)) > MAX_ENTRIES_PER_BYTE * len(data):
             raise MemoryError
     except ImportError as error:
-        sys.exit(f"its format needs the Python package {error.name or error}")
+        raise MeshError(f"its format needs the Python package {error.name or error}") from None
     except MemoryError:
-        sys.exit("it declares more data than it can hold")
+        raise MeshError("it declares more data than it can hold") from None
     except (Exception, SystemExit) as error:
         text = _without_content(str(error), data.lower()) if isinstance(error, (meshio.ReadError, EOFError)) else ""
         text = text if text and "..." not in text else f"the reader of {Path(path).suffix} files stopped here"
-        sys.exit(_place(error, data) + text)
+        raise MeshError(_place(error, data) + text) from None
     if skipped := next((text for text in printed if "cannot handle" in text), None):
-        sys.exit(f"cells of {skipped[skipped.rfind('(') + 1 :].rstrip(').')} of VTK are not known here")
+        raise MeshError(f"cells of {skipped[skipped.rfind('(') + 1 :].rstrip(').')} of VTK are not known here")
     notes = [_without_content(text, data.lower()) for text in printed]
     found = {"points": content.points, "cells": content.cells, "cell_data": content.cell_data, "fibres": content.fibres}
     return found | {"region_names": list(content.region_names.items()), "notes": notes}
@@ -300,7 +294,7 @@ def _open_bounded(file, mode: str = "r", buffering: int = -1, encoding: str | No
     return stream if "b" in mode else _BoundedText(stream, encoding=encoding or "utf-8", **options)
 
 
-TASKS = {"read": _read, "usd": _read_usd, "lone_usd": functools.partial(_read_usd, alone=True), "mesh": _mesh}
+TASKS = {"meshio": _read, "usd": _read_usd, "fill": _fill}
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    serve(answer)

@@ -5,11 +5,9 @@ an envelope around them, and finds the inside by winding numbers.
 Source: Hu, Schneider, Wang, Zorin, Panozzo 2020, Fast tetrahedral meshing in the wild.
 """
 
-import tempfile
 import warnings
 from dataclasses import field
 from importlib.util import find_spec
-from pathlib import Path
 
 import numpy as np
 
@@ -264,8 +262,6 @@ def tetrahedralize(surface: SurfaceMesh, edge_length: float | None = None, envel
 def _run_mesher(name: str, vertices: np.ndarray, triangles: np.ndarray, length: float, envelope: float):
     """Return vertices (n,3) and tets (m,4). length, envelope: fractions of the diagonal."""
     center = vertices.mean(axis=0)  # centre the surface: far from the origin digits are lost
-    with tempfile.TemporaryDirectory(prefix="taisoft-") as folder:
-        np.savez(Path(folder, "surface.npz"), vertices=vertices - center, triangles=triangles, numbers=(length, envelope))
-        with reworded(MeshError, f"{name}: the mesher failed: "):
-            found = run_child(folder, "mesh")
+    with reworded(MeshError, f"{name}: the mesher failed: "):
+        found = run_child("fill", vertices=vertices - center, triangles=triangles, edge_length=length, envelope=envelope)
     return found["vertices"] + center, found["tets"]

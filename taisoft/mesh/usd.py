@@ -3,7 +3,6 @@
 The stage is read in a child process (`usd_content.py` says what is taken), since a broken file may end the process.
 """
 
-import tempfile
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +12,7 @@ import numpy as np
 from taisoft.errors import MeshError, listed, value_text
 from taisoft.files import as_path
 from taisoft.mesh.placing import FROM_Y_UP
-from taisoft.mesh.safe_reading import SECONDS, SECONDS_PER_BYTE, WALL_FACTOR, read_content, run_child
+from taisoft.mesh.safe_reading import read_content, read_in_child
 from taisoft.mesh.surface_mesh import SurfaceMesh, clean_surface, tetrahedralize
 from taisoft.mesh.tet_mesh import TetMesh
 from taisoft.scene.checks import choice
@@ -76,13 +75,11 @@ def _read_prims(path, what: str, alone: bool, up: str) -> tuple[Path, dict[str, 
     if file.suffix.lower() not in USD_FORMATS:
         raise MeshError(f"{file}: a USD stage is read from {', '.join(USD_FORMATS)}, not from {file.suffix or 'no ending'}")
     choice(up, f"{what}: up", FROM_Y_UP, MeshError)
-    seconds = SECONDS + SECONDS_PER_BYTE * len(read_content(file))
-    task = "lone_usd" if alone else "usd"
-    with tempfile.TemporaryDirectory(prefix="taisoft-") as folder:
-        try:
-            found = run_child(folder, task, str(file.absolute()), str(seconds), seconds=WALL_FACTOR * seconds)
-        except MeshError as error:
-            raise MeshError(f"{file}: not a readable USD stage ({error})") from None
+    read_content(file)  # refuses what is no file
+    try:
+        found = read_in_child("usd", file, alone=alone)
+    except MeshError as error:
+        raise MeshError(f"{file}: not a readable USD stage ({error})") from None
     prims: dict[str, _Prim] = {}
     notes = found["notes"]
     for name, prim_path, points, cells in found["meshes"]:

@@ -7,9 +7,10 @@ taken.
 """
 
 import re
-import sys
 
 import numpy as np
+
+from taisoft.errors import MeshError
 
 NAME = "taisoft:name"  # custom data of a body or an obstacle: its name
 MAX_PRIMS = 10_000
@@ -25,24 +26,26 @@ def usd_message(error: Exception) -> str:
 def read_stage(path: str, alone: bool = False) -> dict:
     """Return `meshes` of a stage, each a name, a path, points (n,3) and cells (m,4) tets or (m,3) triangles, and `notes`.
 
-    alone: refuse a stage that names further files, without opening these. Exits with one line if the stage cannot be read or a
-    mesh is inconsistent.
+    alone: refuse a stage that names further files, without opening these. Raises MeshError if the stage cannot be read or a mesh
+    is inconsistent.
     """
     try:
         from pxr import Usd, UsdGeom, UsdUtils
 
         if alone and any(others := UsdUtils.ExtractExternalReferences(path)):
-            sys.exit(f"it names a further file, {next(other[0] for other in others if other)!r}")
+            raise MeshError(f"it names a further file, {next(other[0] for other in others if other)!r}")
         stage = Usd.Stage.Open(path)
         broken = stage.GetCompositionErrors()
         if broken:
             part = re.search(r"@(.+?)@", str(broken[0]))
-            sys.exit(f"its part {part[1]!r} cannot be opened" if part else "it is inconsistent")
+            raise MeshError(f"its part {part[1]!r} cannot be opened" if part else "it is inconsistent")
         found, notes = _meshes(stage, Usd, UsdGeom)
         to_metres = UsdGeom.GetStageMetersPerUnit(stage)
         turn = Y_UP_FROM_Z_UP if UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.z else None
+    except MeshError:
+        raise
     except Exception as error:
-        sys.exit(_why_unreadable(error))
+        raise MeshError(_why_unreadable(error)) from None
     turned = ((*names, points if turn is None else points @ turn, cells) for *names, points, cells in found)
     return {"meshes": [(*names, to_metres * points, cells) for *names, points, cells in turned], "notes": notes}
 
@@ -62,7 +65,7 @@ def _meshes(stage, Usd, UsdGeom) -> tuple[list[tuple[str, str, np.ndarray, np.nd
     prims = [prim for prim in Usd.PrimRange(stage.GetPseudoRoot(), Usd.TraverseInstanceProxies()) if prim.IsA(UsdGeom.PointBased)]
     prims = [prim for prim in prims if prim.IsA(UsdGeom.TetMesh) or prim.IsA(UsdGeom.Mesh)]
     if len(prims) > MAX_PRIMS:
-        sys.exit(f"it holds {len(prims)} meshes, more than {MAX_PRIMS}")
+        raise MeshError(f"it holds {len(prims)} meshes, more than {MAX_PRIMS}")
     for prim in prims:
         if prim.IsA(UsdGeom.TetMesh):
             bodies.add(prim.GetParent().GetPath())
@@ -113,7 +116,7 @@ def _triangles(prim, UsdGeom, notes: list[str]) -> np.ndarray | None:
         return None
     counts, corners = np.array(counts, dtype=np.int64), np.array(corners, dtype=np.int64)
     if len(counts) == 0 or counts.min() < 3 or counts.sum() != len(corners):
-        sys.exit(f"{prim.GetPath()}: faceVertexCounts and faceVertexIndices do not fit together")
+        raise MeshError(f"{prim.GetPath()}: faceVertexCounts and faceVertexIndices do not fit together")
     if mesh.GetSubdivisionSchemeAttr().Get() != UsdGeom.Tokens.none and mesh.GetSubdivisionSchemeAttr().IsAuthored():
         notes.append(f"{prim.GetPath()} is a subdivision surface, of which the control mesh is taken")
     first = np.cumsum(counts) - counts

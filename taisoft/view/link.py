@@ -1,24 +1,23 @@
-"""The link between a simulation and the process that shows it: small messages over a socket, node data in shared memory.
+"""A process beside the simulation that shows or draws its states: both ends of its link, and the memory that they share.
 
-A message is a dict of plain data and arrays in JSON (`taisoft.nested`); nothing is pickled. Displacements and values at the
-nodes, which may be large, lie in memory that both processes map, in one or several slots. The writer fills a slot only after the
-reader has confirmed the message about its previous content, so sending rarely waits for the reader.
+The caller starts `python -m MODULE MEMORY`, a descriptor. Displacements and values at the nodes, which may be large, lie in
+memory that both processes map, in one or several slots; all else travels in messages (`taisoft.processes`). The writer fills a
+slot only after the reader has confirmed the message about its previous content, so sending rarely waits for the reader.
 """
 
 import mmap
 import os
+import sys
 import tempfile
-from multiprocessing import Pipe
-from multiprocessing.connection import Connection
+from collections.abc import Callable
+from contextlib import suppress
 
 import numpy as np
 
-from taisoft.nested import from_json, to_json
+from taisoft.errors import OutputError, TaisoftError, no_memory
+from taisoft.output.files import output_errors
+from taisoft.processes import Child, Link, LinkClosed
 from taisoft.view.drawn import DrawnScene, DrawnState
-
-
-class LinkClosed(Exception):
-    """The other process has ended or closed its end."""
 
 
 class SharedNodes:
@@ -46,10 +45,6 @@ class SharedNodes:
         values = {} if kind == "body" else {kind: self.values[slot].copy()}
         return DrawnState(scene, displacement=self.displacement[slot].copy(), values=values, **rest)
 
-    def close(self) -> None:
-        """Close the descriptor; the memory goes with its last array."""
-        os.close(self.descriptor)
-
 
 def _anonymous_file() -> int:
     """Return the descriptor of a file without a name, in memory where the system offers that."""
@@ -59,34 +54,62 @@ def _anonymous_file() -> int:
         return os.dup(file.fileno())
 
 
-class Link:
-    """One end of the link. connection: to the other process; nodes: the shared memory, once its size is known."""
+class Viewer(Child):
+    """A process that shows or draws the states of a scene, and the memory shared with it.
 
-    def __init__(self, connection: Connection, nodes: SharedNodes | None = None):
-        self._connection, self.nodes = connection, nodes
+    command: arguments of Python, to which the memory's descriptor is appended; scene, description: sent first; failure: what
+    cannot be done without the process, for messages; slots: for the nodes' data. error: what ended it. Raises OutputError if it
+    cannot be started.
+    """
 
-    @classmethod
-    def pair(cls, n_nodes: int, slots: int = 1) -> tuple["Link", Connection]:
-        """Return one end, and the connection of the other one. Raises OSError, for instance without memory."""
-        nodes = SharedNodes(n_nodes, slots)
-        own, other = Pipe()
-        return cls(own, nodes), other
-
-    def send(self, message: dict) -> None:
-        """Send a message. Raises LinkClosed."""
+    def __init__(self, command: tuple[str, ...], scene: DrawnScene, description: dict, failure: str, slots: int = 1):
+        n_nodes, self.failure, self.error = len(scene.start), failure, None
+        with output_errors(f"{failure}: no memory can be shared with its process"):
+            self.nodes = SharedNodes(n_nodes, slots)
+        descriptor = self.nodes.descriptor
         try:
-            self._connection.send_bytes(to_json(message, level=0).encode())
+            super().__init__(*command, str(descriptor), pass_fds=[descriptor], is_quiet=False)
         except OSError as error:
-            raise LinkClosed from error
+            raise OutputError(f"{failure}: its process cannot be started: {error.strerror or error}") from error
+        finally:
+            os.close(descriptor)  # the memory goes with its last array
+        self.send({"scene": scene.plain(), "n_nodes": n_nodes, "slots": slots} | description)
 
-    def receive(self, timeout: float | None = 0.0) -> dict | None:
-        """Return the next message, or None if there is none within the time [s]; None waits for one. Raises LinkClosed."""
+    def send(self, message: dict) -> bool:
+        """Send a message; return whether the process still takes any. If not, the next `read` says why."""
         try:
-            return from_json(self._connection.recv_bytes()) if self._connection.poll(timeout) else None
-        except (EOFError, OSError) as error:
-            raise LinkClosed from error
+            self.link.send(message)
+        except LinkClosed:
+            return False
+        return True
 
-    def close(self) -> None:
-        """Close this end."""
-        self._connection.close()
-        self.nodes.close()
+    def read(self, timeout: float | None) -> dict | None:
+        """Return the next message, as `Link.receive`. Raises OutputError once the process has reported an error or ended."""
+        if self.error is None:
+            try:
+                message = self.link.receive(timeout)
+                if message is None or "error" not in message:
+                    return message
+                self.error = OutputError(message["error"])
+            except LinkClosed:
+                self.error = OutputError(f"{self.failure}: {self.how_it_ended()}")
+        raise self.error
+
+
+def serve(make: Callable[[Link, SharedNodes, DrawnScene, dict], object]) -> None:
+    """Be such a process: run what `make` returns, an object with `run()`, until it or the caller ends.
+
+    make: gets the link, the memory, the scene and the description. Its error is sent as `error`; else `open` is.
+    """
+    link = Link.to_caller()
+    with suppress(LinkClosed):
+        description = link.receive(None)
+        try:
+            nodes = SharedNodes(description["n_nodes"], description["slots"], int(sys.argv[1]))
+            served = make(link, nodes, DrawnScene.from_plain(description["scene"]), description)
+        except (TaisoftError, MemoryError) as error:
+            error = no_memory("a scene to show", error) if isinstance(error, MemoryError) else error
+            link.send({"error": str(error)})
+            return
+        link.send({"open": True})
+        served.run()

@@ -1,19 +1,18 @@
-"""The process that draws a run's pictures: `python -m taisoft.view.picture_process SOCKET MEMORY`, see `taisoft.view.pictures`.
+"""The process that draws a run's pictures: `python -m taisoft.view.picture_process MEMORY`, see `taisoft.view.pictures`.
 
 It gets a description of the scene, then states, which it draws, codes and writes in their order. It says when a state is drawn,
 and on request when all pictures are written. When its caller ends without a request, the pictures that wait are dropped.
 """
 
 import os
-import sys
 from pathlib import Path
 from types import SimpleNamespace
 
 from taisoft.compile_message import silenced
 from taisoft.errors import TaisoftError, no_memory, reason
-from taisoft.view.child_process import serve
+from taisoft.processes import Link, LinkClosed
 from taisoft.view.drawn import DrawnScene
-from taisoft.view.link import Link, LinkClosed
+from taisoft.view.link import SharedNodes, serve
 from taisoft.view.pictures import FAILURE, PictureOptions, picture_writer
 from taisoft.view.plots import PlotChoice
 
@@ -21,17 +20,18 @@ from taisoft.view.plots import PlotChoice
 class Drawing:
     """Draws the states that come over a link. description: of the scene and the pictures. Raises OutputError."""
 
-    def __init__(self, link: Link, description: dict):
-        self._link, self._caller = link, description["caller"]
-        self._scene, options = DrawnScene.from_plain(description["scene"]), PictureOptions(**description["options"])
+    def __init__(self, link: Link, nodes: SharedNodes, scene: DrawnScene, description: dict):
+        self._link, self._nodes, self._scene, self._caller = link, nodes, scene, description["caller"]
+        options = PictureOptions(**description["options"])
         self._plots = PlotChoice(None, description["enabled"], tuple(options.plots)) if options.plots else None
-        self._writer = picture_writer(Path(description["folder"]), self._scene, options, self._plots)
+        self._writer = picture_writer(Path(description["folder"]), scene, options, self._plots)
 
     def run(self) -> None:
-        """Draw until the caller asks for the end or ends. The error that ends it before is sent."""
+        """Draw until the link is closed, which raises LinkClosed. The error that ends it before is sent."""
         try:
             with silenced():
-                while "end" not in (message := self._link.receive(None)):
+                while True:
+                    message = self._link.receive(None)
                     if os.getppid() != self._caller:  # its pictures in the folder may be another run's by now
                         return
                     self._take(message)
@@ -51,7 +51,7 @@ class Drawing:
             self._writer.flush()
             self._link.send({"flushed": True})
             return
-        state = self._link.nodes.take(self._scene, message["state"], message["slot"])
+        state = self._nodes.take(self._scene, message["state"], message["slot"])
         if self._plots is not None:
             self._plots.history, self._plots.enabled = SimpleNamespace(**message["history"]), message["enabled"]
         self._writer.frame(state, message["index"])
@@ -60,4 +60,4 @@ class Drawing:
 
 
 if __name__ == "__main__":
-    serve(Drawing, *map(int, sys.argv[1:]))
+    serve(Drawing)

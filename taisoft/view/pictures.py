@@ -14,9 +14,8 @@ from taisoft.machine import usable_cores
 from taisoft.output.files import make_folder
 from taisoft.output.frames import FRAMES_NAME, FrameWriter
 from taisoft.view.annotations import Annotations
-from taisoft.view.child_process import ChildProcess
 from taisoft.view.drawn import DrawnScene, DrawnState
-from taisoft.view.link import LinkClosed
+from taisoft.view.link import Viewer
 from taisoft.view.offscreen import SIZE, Offscreen
 from taisoft.view.plots import PlotChoice, Plots, plain_history
 from taisoft.view.scene_view import IN_PICTURES
@@ -70,7 +69,7 @@ def open_pictures(
     return PictureProcess(folder, scene, options, plots)
 
 
-class PictureProcess:
+class PictureProcess(Viewer):
     """Writes folder/frames/<index>.png of states in another process.
 
     plots: history of options.plots; child: arguments of Python that start the process, if not CHILD. What fails in the other
@@ -89,41 +88,34 @@ class PictureProcess:
         self.folder = make_folder(Path(folder) / FRAMES_NAME).absolute()
         self._options, self._plots = options, plots if options.plots else None
         self._sent = self._drawn = 0  # numbers of states
-        self._flushed, self._error = True, None
+        self._closed, self._flushed = False, True
         self._drawn_at, self._kept = None, [options.kept, options.kept]  # time of the last picture [s]; before it, and after it
-        description = {"scene": scene.plain(), "options": asdict(options), "folder": str(self.folder.parent)}
-        description |= {"caller": os.getpid(), "enabled": self._plots.enabled if self._plots else {}}
-        self._child: ChildProcess | None = ChildProcess(child or CHILD, description, FAILURE, len(scene.start), SLOTS)
-
-    @property
-    def pid(self) -> int | None:
-        """Number of the other process, None after `close`."""
-        return self._child and self._child.pid
+        description = {"options": asdict(options), "folder": str(self.folder.parent), "caller": os.getpid()}
+        description |= {"enabled": self._plots.enabled if self._plots else {}}
+        super().__init__(child or CHILD, scene, description, FAILURE, SLOTS)
 
     def frame(self, state: DrawnState, index: int) -> None:
         """Hand over a state, to be drawn as picture number index. Raises OutputError."""
-        if self._child is None:
+        if self._closed:
             raise OutputError(f"picture {index} cannot be written to {self.folder}: its writer is closed")
-        self._raise()
-        while self._read(0.0):
+        while self._take(0.0):
             pass
         while self._sent - self._drawn >= SLOTS:
-            self._read(None)
-        nodes, slot = self._child.link.nodes, self._sent % SLOTS
-        message = {"state": nodes.put(state, self._options.colour, slot), "slot": slot, "index": index}
+            self._take(None)
+        slot = self._sent % SLOTS
+        message = {"state": self.nodes.put(state, self._options.colour, slot), "slot": slot, "index": index}
         if self._plots is not None:
             message |= {"enabled": self._plots.enabled, "history": plain_history(self._plots.history)}
         self._sent += 1
-        self._send(message)
+        self.send(message)
 
     def flush(self) -> None:
         """Wait until all pictures are written. Raises OutputError."""
-        self._raise()
-        if self._child is not None:
+        if not self._closed:
             self._flushed = False
-            self._send({"flush": True})
+            self.send({"flush": True})
             while not self._flushed:
-                self._read(None)
+                self._take(None)
 
     def kept(self, time: float) -> dict:
         """Return, after a flush, what pictures from time [s] on depend on, as `Offscreen.kept`."""
@@ -131,38 +123,20 @@ class PictureProcess:
 
     def close(self) -> None:
         """Write the pictures that wait, and end the process; a second call does nothing. Raises OutputError."""
-        if self._child is None:
-            return
-        try:
-            self.flush()
-        finally:
-            child, self._child = self._child, None
-            threading.Thread(target=child.close, name="end of pictures").start()  # which takes a fifth of a second
+        if not self._closed:
+            try:
+                self.flush()
+            finally:
+                self._closed = True
+                threading.Thread(target=super().close, name="end of pictures").start()  # which takes a fifth of a second
 
-    def _send(self, message: dict) -> None:
-        try:
-            self._child.link.send(message)
-        except LinkClosed:
-            while self._read(None):  # the process may have said why it ended
-                pass
-
-    def _read(self, timeout: float | None) -> bool:
+    def _take(self, timeout: float | None) -> bool:
         """Read the next message and return whether there was one; wait up to a time [s], or without limit for None."""
-        try:
-            message = self._child.link.receive(timeout)
-        except LinkClosed:
-            message = {"error": f"{FAILURE}: {self._child.how_it_ended()}"}
+        message = self.read(timeout)
         if message is None:
             return False
-        if "error" in message:
-            self._error = OutputError(message["error"])
-            raise self._error
         if "drawn" in message:
             self._drawn += 1
             self._drawn_at, self._kept = message["drawn"], message["kept"]
         self._flushed |= "flushed" in message
         return True
-
-    def _raise(self) -> None:
-        if self._error is not None:
-            raise self._error

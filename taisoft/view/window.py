@@ -8,15 +8,13 @@ ends with its caller, however that ends.
 
 import time
 import warnings
-from typing import NoReturn
 
 from taisoft.errors import OutputError
 from taisoft.frames import dt_sentence, fit_dt
 from taisoft.records import RunReport, StepReport
-from taisoft.view.child_process import ChildProcess
 from taisoft.view.controls import touching_pairs
 from taisoft.view.ggui import display_missing, vulkan_missing
-from taisoft.view.link import LinkClosed
+from taisoft.view.link import Viewer
 from taisoft.view.live import LiveRun
 from taisoft.view.sampling import Sampler
 from taisoft.view.scene_view import IN_WINDOW
@@ -27,13 +25,13 @@ FPS = 60.0  # of the window's pictures, at most
 CHILD = ("-P", "-m", "taisoft.view.window_process")
 
 
-class WindowProcess:
+class WindowProcess(Viewer):
     """A window in a child process that shows a simulation.
 
     sim: a Simulator; controls: whether the window changes it, or only shows it; colour, layers: those shown initially;
     child: arguments of Python that start the process, if not CHILD.
-    closed: whether it is; timing: once its user has closed it, times of its pictures and latencies of drags, see
-    `taisoft.view.timing`. Raises OutputError if a display or a Vulkan driver is missing or the window does not open.
+    timing: once its user has closed it, times of its pictures and latencies of drags, see `taisoft.view.timing`. Raises
+    OutputError if a display or a Vulkan driver is missing or the window does not open.
     """
 
     def __init__(
@@ -50,28 +48,22 @@ class WindowProcess:
         self._sampler, self._colour, self._layers = Sampler(sim.scene), colour, set(layers)
         self._sent = self._confirmed = self._answered = 0  # numbers of states, and of the last request
         self._requests: list[tuple[int, list]] = []  # not yet returned
-        self.closed, self.timing = False, {}
-        drawn = self._sampler.drawn
-        description = {"scene": drawn.plain(), "fps": FPS, "colour": colour, "layers": list(layers)}
+        self._closed, self.timing = False, {}
+        description = {"fps": FPS, "colour": colour, "layers": list(layers)}
         description |= {"controls": controls, "pairs": touching_pairs(sim) if controls else []}
-        self._child = ChildProcess(child or CHILD, description, FAILURE, len(drawn.start))
-        self._link = self._child.link
+        super().__init__(child or CHILD, self._sampler.drawn, description, FAILURE)
         try:
-            self._wait_until_open()
+            if self.read(START_SECONDS) is None:
+                raise OutputError(f"{FAILURE}: its process does not answer within {START_SECONDS:g} s")
         except BaseException:
             self.close()
             raise
+        self.failure = "the window is lost"
 
-    def _wait_until_open(self) -> None:
-        """Wait until the window is open. Raises OutputError."""
-        try:
-            answer = self._link.receive(START_SECONDS)
-        except LinkClosed:
-            raise OutputError(f"{FAILURE}: {self._child.how_it_ended()}") from None
-        if answer is None:
-            raise OutputError(f"{FAILURE}: its process does not answer within {START_SECONDS:g} s")
-        if "error" in answer:
-            raise OutputError(answer["error"])
+    @property
+    def closed(self) -> bool:
+        """Whether the window is closed or lost."""
+        return self._closed or self.error is not None
 
     @property
     def ready(self) -> bool:
@@ -83,25 +75,19 @@ class WindowProcess:
 
         Raises OutputError if the window's process has ended otherwise than by being closed.
         """
-        while self._read(timeout):
+        while self._take(timeout):
             timeout = 0.0
         found, self._requests = self._requests, []
         if found:
             self._answered = found[-1][0]
         return found
 
-    def _read(self, timeout: float) -> bool:
+    def _take(self, timeout: float) -> bool:
         """Read the next message; return whether there was one."""
-        if self.closed:
-            return False
-        try:
-            message = self._link.receive(timeout)
-        except LinkClosed:
-            self._lose()
-        if message is None:
+        if self.closed or (message := self.read(timeout)) is None:
             return False
         if "closed" in message:
-            self.closed, self.timing = True, message
+            self._closed, self.timing = True, message
             return False
         self._confirmed = message["confirmed"]
         self._colour, self._layers = message["colour"], set(message["layers"])
@@ -117,25 +103,19 @@ class WindowProcess:
         """
         end = time.perf_counter() + patience
         while not self.ready and not self.closed and (left := end - time.perf_counter()) > 0.0:
-            self._read(left)
+            self._take(left)
         if not self.ready or self.closed:
             return
-        state = self._link.nodes.put(self._sampler.state(sim, self._layers, [self._colour]), self._colour)
+        state = self.nodes.put(self._sampler.state(sim, self._layers, [self._colour]), self._colour)
         self._sent += 1
-        try:
-            self._link.send({"state": state, "number": self._sent, "answered": self._answered} | shown)
-        except LinkClosed:
-            while self._read(0.0):  # it may have been closed by its user
+        if not self.send({"state": state, "number": self._sent, "answered": self._answered} | shown):
+            while self._take(0.0):  # it may have been closed by its user
                 pass
 
     def close(self) -> None:
         """Close the window and wait for its process; a second call does nothing."""
-        self.closed = True
-        self._child.close()
-
-    def _lose(self) -> NoReturn:
-        self.closed = True
-        raise OutputError(f"the window is lost: {self._child.how_it_ended()}")
+        self._closed = True
+        super().close()
 
 
 class LiveWindow:

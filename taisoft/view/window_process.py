@@ -1,15 +1,14 @@
-"""The process of the live window: `python -m taisoft.view.window_process SOCKET MEMORY`, two descriptors that it inherits.
+"""The process of the live window: `python -m taisoft.view.window_process MEMORY`, see `taisoft.view.link`.
 
 It gets a description of the scene, then states, and sends what the window shows and which commands the user has given. It ends
-when the window is closed, when the other process asks for it, and when that process ends.
+when the window is closed, and with the link.
 """
 
-import sys
 import time
 
-from taisoft.view.child_process import serve
+from taisoft.processes import Link
 from taisoft.view.drawn import DrawnScene, DrawnState
-from taisoft.view.link import Link
+from taisoft.view.link import SharedNodes, serve
 from taisoft.view.panel import Requests
 from taisoft.view.screen import Screen
 
@@ -20,20 +19,19 @@ SLOWEST = 1.0 / 25.0  # time between two pictures above which there is no such p
 
 
 class View:
-    """The window with the state that it shows. link: to the simulation, with the description that came over it."""
+    """The window with the state that it shows. link: to the simulation; nodes: shared with it; description: of the window."""
 
-    def __init__(self, link: Link, description: dict):
-        self._link, self._scene, self._requests = link, DrawnScene.from_plain(description["scene"]), Requests()
-        self._drawn = DrawnState.at_start(self._scene)
-        self._screen = Screen(self._scene, description, self._requests)
+    def __init__(self, link: Link, nodes: SharedNodes, scene: DrawnScene, description: dict):
+        self._link, self._nodes, self._scene, self._requests = link, nodes, scene, Requests()
+        self._drawn = DrawnState.at_start(scene)
+        self._screen = Screen(scene, description, self._requests)
         self._interval = 1.0 / description["fps"]
         self._state: dict = {}
         self._came = 0.0  # when the state came
         self._confirmed: tuple | None = None  # the last message but for commands
-        self._ended = False
 
     def run(self) -> None:
-        """Draw until the window is closed or the simulation ends it; then close the window."""
+        """Draw until the window is closed, or the link, which raises LinkClosed; then close the window."""
         try:
             self._draw()
         finally:
@@ -41,36 +39,32 @@ class View:
 
     def _draw(self) -> None:
         self._receive(None)
-        while not self._ended and not self._screen.closed:
+        while not self._screen.closed:
             begin = time.perf_counter()
             self._screen.draw(self._drawn, self._state, begin - self._came)
             self._send()
             self._wait(begin, time.perf_counter())
-        if not self._ended:
-            timing = self._screen.timing
-            self._link.send({"closed": True, "pictures": list(timing.pictures), "latencies": list(timing.latencies)})
+        timing = self._screen.timing
+        self._link.send({"closed": True, "pictures": list(timing.pictures), "latencies": list(timing.latencies)})
 
     def _wait(self, begin: float, end: float) -> None:
         """Take over states until the next picture is due; begin, end: of the last one [s]."""
         idle = 0.0 if self._screen.dragging else IDLE_SHARE * (end - begin)
         due = max(begin + self._interval, min(end + idle, begin + SLOWEST))
-        while not self._ended and (left := due - time.perf_counter()) > 0.0:
+        while (left := due - time.perf_counter()) > 0.0:
             self._receive(left)
         # a drag that has no effect in the next picture has to wait for the one after it
         limit = max(ANSWER, end - begin)
-        while not self._ended and (left := self._screen.timing.seconds_to_answer(limit)) > 0.0:
+        while (left := self._screen.timing.seconds_to_answer(limit)) > 0.0:
             self._receive(left)
         self._receive(0.0)
 
     def _receive(self, timeout: float | None) -> None:
         """Take over all states that have come; wait up to a time [s] for the first."""
-        while not self._ended and (message := self._link.receive(timeout)) is not None:
+        while (message := self._link.receive(timeout)) is not None:
             timeout = 0.0
-            if "end" in message:
-                self._ended = True
-                return
             self._state, self._came = message, time.perf_counter()
-            self._drawn = self._link.nodes.take(self._scene, message["state"])
+            self._drawn = self._nodes.take(self._scene, message["state"])
             self._screen.timing.came(message)
             self._send()  # at once, so that the simulation may send the next one
 
@@ -88,4 +82,4 @@ class View:
 
 
 if __name__ == "__main__":
-    serve(View, *map(int, sys.argv[1:]))
+    serve(View)

@@ -13,13 +13,10 @@ class InProcess:
     def __init__(self, cores, child, threads):
         self.cores, self.threads = cores, threads
 
-    def start(self, request: dict) -> None:
+    def execute(self, request: dict) -> dict:
         self.requests.append(request["parameters"])
         answer = {"crash": self.crash} if self.crash else make.answer(from_json(to_json(request)))
-        self._answer = from_json(to_json(answer))
-
-    def poll(self) -> dict:
-        return self._answer
+        return from_json(to_json(answer))
 
     def stop(self) -> None:
         pass

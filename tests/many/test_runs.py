@@ -16,9 +16,10 @@ import numpy as np
 import pytest
 
 import taisoft as ts
+from taisoft import processes
 from taisoft.errors import OutputError, SceneError, SimulationError
 from taisoft.machine import thread_count
-from taisoft.many import make, places, runs
+from taisoft.many import make, runs
 from taisoft.many.results import Results
 from taisoft.nested import from_json
 from taisoft.output.files import FolderLock
@@ -175,7 +176,7 @@ def test_what_cannot_be_run_is_refused(tmp_path, requests, monkeypatch):
     monkeypatch.delattr(makes, "__file__")
     with pytest.raises(SceneError, match="add, is defined in a notebook or console.*%%writefile my_runs.py"):
         ts.run_many(makes.add, ROWS)
-    monkeypatch.setattr(places, "serving", True)
+    monkeypatch.setattr(processes, "serving", True)
     with pytest.raises(SceneError, match="if __name__ == '__main__'"):
         ts.run_many(makes.add, ROWS)
     assert not (tmp_path / "out").exists() and requests == []

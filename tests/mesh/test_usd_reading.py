@@ -151,7 +151,7 @@ def test_broken_stages_give_one_sentence(tmp_path):
         (FACE.format([3, 4], [0, 0, 0]), "do not fit together"),
     ):
         path.write_text(content)
-        with pytest.raises(SystemExit, match=message):
+        with pytest.raises(MeshError, match=message):
             read_stage(str(path))
 
 

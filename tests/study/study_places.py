@@ -12,18 +12,14 @@ class InProcess:
     cores = [0]
 
     def __init__(self):
-        self.requests, self._answer = [], None
+        self.requests = []
 
-    def start(self, request: dict) -> None:
+    def execute(self, request: dict) -> dict:
         self.requests.append(request)
-        self._answer = from_json(to_json(answer(request)))
-
-    def poll(self) -> dict | None:
-        answer, self._answer = self._answer, None
-        return answer
+        return from_json(to_json(answer(request)))
 
     def stop(self) -> None:
-        self._answer = None
+        pass
 
 
 class Pendulum(InProcess):
@@ -36,13 +32,12 @@ class Pendulum(InProcess):
         super().__init__()
         self.plan, self.failing, self.crashing = plan, dict(failing), dict(crashing)
 
-    def start(self, request: dict) -> None:
+    def execute(self, request: dict) -> dict:
         self.requests.append(request)
         if request["action"] == "plan":
-            self._answer = {"answer": self.plan}
-            return
+            return {"answer": self.plan}
         dt = request["task"]["setting"]["dt"]
-        self._answer = {"crash": self.crashing[dt]} if dt in self.crashing else {"answer": self._record(request["task"])}
+        return {"crash": self.crashing[dt]} if dt in self.crashing else {"answer": self._record(request["task"])}
 
     def _record(self, task: dict) -> dict:
         setting, A, eye = task["setting"], np.array([[0.0, 1.0], [-1.0, 0.0]]), np.eye(2)

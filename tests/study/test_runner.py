@@ -9,6 +9,7 @@
 import csv
 import io
 import json
+import threading
 from dataclasses import asdict, replace
 
 import numpy as np
@@ -115,9 +116,26 @@ def test_study_without_its_reference_has_times_but_no_errors(tmp_path):
     assert "no setting has both a time and an error" in write(study, tmp_path) and not (tmp_path / "study.png").exists()
 
 
+class Endless(Pendulum):
+    """Its third run, after the request for a plan, takes until it is stopped."""
+
+    def __init__(self):
+        super().__init__(plan())
+        self.stopped = threading.Event()
+
+    def execute(self, request):
+        answer = super().execute(request)
+        if len(self.requests) == 4:
+            self.stopped.wait()
+        return answer
+
+    def stop(self):
+        if len(self.requests) == 4:
+            self.stopped.set()
+
+
 def test_runs_beyond_the_budget_are_left_out(tmp_path):
-    place = Pendulum(plan())
-    # the budget is 3 runs; the first of the requests is planning
+    place = Endless()
     study = run(place, Store(tmp_path), left=lambda: 4.0 - len(place.requests))
     left_out = [row for row in study.rows if row.status == "left out"]
     assert left_out[0].reason == "the budget was spent while it ran"
@@ -170,7 +188,7 @@ def test_damaged_records_are_reported_and_repeated(tmp_path, damage):
 def test_interrupted_study_keeps_finished_runs(tmp_path):
     place = Pendulum(plan())
     study = run(place, Store(tmp_path), requested=lambda: len(place.requests) >= 5)
-    assert study.ended == "it was interrupted" and len(list((tmp_path / "runs").iterdir())) == 3
+    assert study.ended == "it was interrupted" and len(list((tmp_path / "runs").iterdir())) == 4
     assert run(Pendulum(plan()), requested=lambda: True) is None
 
 

@@ -5,10 +5,7 @@
   study; the run of a lost place moves to another one.
 """
 
-import json
 import os
-import subprocess
-import sys
 from types import SimpleNamespace
 
 import numpy as np
@@ -19,9 +16,10 @@ from taisoft.errors import SceneError
 from taisoft.machine import usable_cores
 from taisoft.many.cluster import cluster_places
 from taisoft.many.places import LocalPlace, carry_out
+from taisoft.processes import Child
 from taisoft.study import Request
 from taisoft.study.runner import CHILD, Runner, tasks_of
-from tests.cli.command import ROOT, write
+from tests.cli.command import write
 from tests.study.study_places import InProcess
 
 SCENE = '''"""A bar: fixed at one end, or in free flight."""
@@ -130,17 +128,17 @@ def test_processes_that_exit_early_are_reported(tmp_path):
     answers = answers_of([("a", request(path))], [LocalPlace(usable_cores(), CHILD)])
     assert answers["a"] == {"crash": "its process ended with exit status 7 without an answer: hello"}
     child = ("-c", "import os; os._exit(3)")
-    large = {"text": "x" * 1_000_000}  # more than a pipe holds
+    large = {"text": "x" * 1_000_000}  # more than a link holds
     answers = answers_of([("a", large)], [LocalPlace(usable_cores(), child)])
     assert answers["a"] == {"crash": "its process ended with exit status 3 without an answer"}
 
 
 def test_a_run_ends_with_its_study(tmp_path):
-    """Its process ends when its stdin closes."""
-    process = subprocess.Popen((sys.executable, *CHILD), stdin=subprocess.PIPE, env=os.environ | {"PYTHONPATH": str(ROOT)})
-    path = write(tmp_path / "slow.py", "import time\ntime.sleep(100)\n")
-    process.communicate(json.dumps(request(path)).encode() + b"\n", timeout=60)
-    assert process.returncode == 1
+    """Its process ends when its link is closed."""
+    child = Child(*CHILD)
+    child.link.send(request(write(tmp_path / "slow.py", "import time\ntime.sleep(100)\n")))
+    child.link.close()
+    assert child.how_it_ended() == "its process ended by signal SIGKILL"
 
 
 def test_workers_of_a_cluster_use_separate_cores_and_may_be_lost():
@@ -154,9 +152,9 @@ def test_workers_of_a_cluster_use_separate_cores_and_may_be_lost():
         places(("a", [0]), ("a", [0]))
 
     class Place(InProcess):
-        def start(self, request):
+        def execute(self, request):
             self.requests.append(request)
-            self._answer = {"lost": "it is gone"} if self.is_lost else {"answer": request}
+            return {"lost": "it is gone"} if self.is_lost else {"answer": request}
 
     lost, kept = Place(), Place()
     lost.is_lost, kept.is_lost = True, False

@@ -1,6 +1,7 @@
 """Pictures drawn in a process of their own: the link to it, the same bytes as those drawn between the steps, errors and ends."""
 
 import os
+from multiprocessing import Pipe
 
 import numpy as np
 import pytest
@@ -9,12 +10,13 @@ import taisoft as ts
 from taisoft.errors import OutputError
 from taisoft.nested import from_json, to_json
 from taisoft.output.viewpoint import camera_viewpoint, framed_points
+from taisoft.processes import Link, LinkClosed
 from taisoft.records import StepReport
 from taisoft.scene.checks import store
 from taisoft.scene.plan import Plan
 from taisoft.view import pictures
 from taisoft.view.drawn import DrawnScene
-from taisoft.view.link import Link, LinkClosed, SharedNodes
+from taisoft.view.link import SharedNodes
 from taisoft.view.pictures import MIN_PICTURES, SLOTS, PictureOptions, PictureProcess, open_pictures, picture_writer
 from taisoft.view.plots import Plots
 from taisoft.view.sampling import Sampler
@@ -41,12 +43,14 @@ def test_messages_keep_their_data():
 
 
 def test_both_ends():
-    link, other = Link.pair(5, slots=2)
-    far = Link(other, SharedNodes(5, 2, os.dup(link.nodes.descriptor)))
-    link.nodes.displacement[1], link.nodes.values[0] = np.arange(15.0).reshape(5, 3), np.arange(5.0)
+    nodes = SharedNodes(5, slots=2)
+    same = SharedNodes(5, 2, os.dup(nodes.descriptor))
+    nodes.displacement[1], nodes.values[0] = np.arange(15.0).reshape(5, 3), np.arange(5.0)
     for name in ("displacement", "values"):
-        assert np.array_equal(getattr(far.nodes, name), getattr(link.nodes, name))
-    assert not far.nodes.displacement[0].any() and not far.nodes.values[1].any() and link.receive() is None
+        assert np.array_equal(getattr(same, name), getattr(nodes, name))
+    assert not same.displacement[0].any() and not same.values[1].any()
+    link, far = map(Link, Pipe())
+    assert link.receive() is None
     link.send({"time": 1.0})
     assert far.receive(None) == {"time": 1.0}
     far.send({"commands": [["pause"]]})
@@ -151,8 +155,7 @@ def test_both_ways_write_the_same_bytes(name, tmp_path):
 
 
 FAILING = """
-import sys
-from taisoft.view.child_process import serve
+from taisoft.view.link import serve
 from taisoft.view.offscreen import Offscreen
 from taisoft.view.picture_process import Drawing
 image, left = Offscreen.image, [1, 2]
@@ -162,7 +165,7 @@ def failing(self, sim):
     left.pop()
     return image(self, sim)
 Offscreen.image = failing
-serve(Drawing, *map(int, sys.argv[1:]))
+serve(Drawing)
 """
 
 

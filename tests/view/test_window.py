@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from taisoft.errors import OutputError
-from taisoft.view.child_process import ChildProcess
+from taisoft.view.drawn import DrawnScene
+from taisoft.view.link import Viewer
 from taisoft.view.window import LiveWindow, WindowProcess, show
 from tests.view.desktop import ROOT, TOOLS, Desktop
 from tests.view.drawing import body_mask, needs_vulkan, program
@@ -14,11 +15,11 @@ from tests.view.fake_simulator import FakeSimulator, beam_scene
 
 START = """
 import sys, time
-from multiprocessing.connection import Connection
-from taisoft.view.link import Link, LinkClosed, SharedNodes
-link = Link(Connection(int(sys.argv[1])))
+from taisoft.processes import Link
+from taisoft.view.link import SharedNodes
+link = Link.to_caller()
 description = link.receive(None)
-link.nodes = SharedNodes(description["n_nodes"], description["slots"], int(sys.argv[2]))
+nodes = SharedNodes(description["n_nodes"], description["slots"], int(sys.argv[1]))
 request = {"number": 0, "commands": [], "confirmed": 0, "colour": "body", "layers": []}
 """
 OPEN = START + "link.send({'open': True})\n"
@@ -39,13 +40,13 @@ def test_states_go_out_when_the_last_one_is_confirmed(simulator, tmp_path):
     code = f"""{OPEN}
 import numpy as np
 link.receive(None)
-first = link.nodes.displacement[0].copy()
+first = nodes.displacement[0].copy()
 time.sleep(0.3)
 for number in (4, 5):
     wishes = {{"colour": "speed", "layers": ["contacts"], "commands": [["pause"], ["step"]]}}
     link.send(request | wishes | {{"confirmed": number - 4, "number": number}})
 state = link.receive(None)
-nodes, path = link.nodes, {str(tmp_path / "saved.npz")!r}
+path = {str(tmp_path / "saved.npz")!r}
 np.savez(path, first=first, x=nodes.displacement[0], values=nodes.values[0], answered=state["answered"],
          contacts=state["state"]["contacts"]["point"], time=state["state"]["time"])
 link.send({{"closed": True}})
@@ -100,15 +101,14 @@ def test_a_lost_window_is_an_error_but_a_run_goes_on(simulator, monkeypatch):
 def test_a_window_ends_with_the_process_of_the_simulation():
     """Whose end of the link is closed then."""
     code = """
-import sys
 from types import SimpleNamespace
-from taisoft.view.child_process import serve
-serve(lambda link, _: SimpleNamespace(run=lambda: link.receive(None)), *map(int, sys.argv[1:]))
+from taisoft.view.link import serve
+serve(lambda link, *_: SimpleNamespace(run=lambda: link.receive(None)))
 """
-    child = ChildProcess(program(code), {}, "no window", n_nodes=3)
-    assert child.link.receive(30.0) == {"open": True}
-    child.link.close()
-    assert child.how_it_ended() == "its process ended with exit status 0"
+    viewer = Viewer(program(code), DrawnScene.of(beam_scene()), {}, "no window")
+    assert viewer.read(30.0) == {"open": True}
+    viewer.link.close()
+    assert viewer.how_it_ended() == "its process ended with exit status 0"
 
 
 WATCH = """
