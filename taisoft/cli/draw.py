@@ -47,7 +47,6 @@ def draw(arguments: Namespace) -> int:
                     drawn += 1
             if arguments.video and not signals.requested():
                 make_video(folder.path, fps / slow)
-            folder.discard_stale()
         print(f"pictures {out / FRAMES_NAME}/ ({drawn} of {len(run)} frames of {run.folder})")
         if (out / VIDEO_NAME).exists():
             print(f"film     {out / VIDEO_NAME}")

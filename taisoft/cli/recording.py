@@ -12,7 +12,7 @@ from taisoft.cli.pictures import names_of, picture_options, slowness
 from taisoft.details import DETAILS, QUANTITIES
 from taisoft.errors import OutputError, SceneError
 from taisoft.nested import to_json
-from taisoft.output.files import RESULT_FILES, RESULT_FOLDERS, CheckpointWriter, OutputFolder
+from taisoft.output.files import CHECKPOINT_NAME, RESULT_FILES, RESULT_FOLDERS, Observer, OutputFolder
 from taisoft.output.frame_files import VTU_NAME, VtuWriter, cut_pvd
 from taisoft.output.frame_table import FrameTable
 from taisoft.output.frames import FRAMES_NAME, VIDEO_NAME, ffmpeg_command, find_ffmpeg, picture_numbers, write_video
@@ -99,11 +99,11 @@ class Observers:
     """Passes every frame to its members; after the first write error the run should end.
 
     errors: the distinct messages of all OutputErrors; seconds, picture_seconds: wall time spent in the members, and in writers
-    of pictures [s], without compiling, as in the wall time of a run. A member has frame(sim, index) and close().
+    of pictures [s], without compiling, as in the wall time of a run.
     """
 
     def __init__(self) -> None:
-        self.members: list = []
+        self.members: list[Observer] = []
         self.errors: list[str] = []
         self.seconds = self.picture_seconds = 0.0
 
@@ -116,6 +116,11 @@ class Observers:
             seconds = time.perf_counter() - start - (sim.compile_seconds - compiled)
             self.seconds += seconds
             self.picture_seconds += seconds if isinstance(member, StateWriter) and member.members else 0.0
+
+    def flush(self) -> None:
+        """Write what waits in the members. Raises OutputError."""
+        for member in self.members:
+            member.flush()
 
     def close(self) -> None:
         """Close all members, last first, even if some fail."""
@@ -135,13 +140,13 @@ class Observers:
         return True
 
 
-class Recording:
+class Recording(Observer):
     """Results of a run in one folder: report.json, steps.csv, checkpoint.npz and, if requested, states, pictures, USD and .vtu.
 
     resumed: for a resumed run, the `checkpoint`, its `time` [s] and the first `frame`; earlier results in the folder are
-    continued. every: simulated time between two checkpoints [s]; None for one at the end. notes: those of the checkpoint of
-    a resumed run. Raises OutputError if the folder cannot be written, or holds results and neither overwrite nor resumed is
-    given.
+    continued. every: simulated time between two checkpoints, which are written at frames [s]; None for one at the end. notes:
+    those of the checkpoint of a resumed run. Raises OutputError if the folder cannot be written, or holds results and neither
+    overwrite nor resumed is given.
     """
 
     def __init__(
@@ -149,8 +154,8 @@ class Recording:
     ):
         self._first = None if resumed is None else resumed["frame"]
         self._folder = OutputFolder(path, overwrite, self._first)
-        self.path, self._resumed, self._notes = Path(path), resumed, notes or {}
-        self._checkpoints = CheckpointWriter(self._folder.path, every)
+        self.path, self._resumed, self._notes, self._every = Path(path), resumed, notes or {}, every
+        self._saved: float | None = None  # simulated time of the last checkpoint, or of the start
 
     def add_writers(
         self, observers: Observers, sim, name: str, fps: float | None, seconds: float, shown: DisplayOptions, plots: Plots | None
@@ -160,55 +165,57 @@ class Recording:
 
         A resumed run that does not match the earlier files is refused before anything is removed.
         """
-        folder, kept = self._folder.path, tuple(self._notes.get("keep", KEPT))
+        folder, kept, first = self._folder.path, tuple(self._notes.get("keep", KEPT)), self._first or 0
         keep, values = kept if shown.keep is None else shown.keep, NodalValues(sim.scene.bodies, by_step=True)
         if "keep" in self._notes and keep != kept:
             given, before = (",".join(one) or "none" for one in (keep, kept))
             raise OutputError(f"--keep {given}: the run that is resumed keeps {before}, so that all its states are alike")
         if shown.usd:
             numbers = {"fps": fps or 1.0 / sim.dt, "self_collision": sim.settings.self_collision}
-            numbers |= {"first": self._first or 0, "errors": shown.errors, "values": values}
-            usd = UsdWriter(folder, sim.scene, **numbers)
-            observers.members.append(usd)
-            self._checkpoints.before.append(usd.flush)
+            observers.members.append(UsdWriter(folder, sim.scene, **numbers, first=first, errors=shown.errors, values=values))
         if FrameTable.needed(sim.scene):
-            table = FrameTable(folder, sim.scene, self._first or 0)
-            observers.members.append(table)
-            self._checkpoints.before.append(table.flush)
+            observers.members.append(FrameTable(folder, sim.scene, first))
         if self._first is not None:
-            cut_pvd(folder, self._first)
-            self._folder.clear(self._first)
+            cut_pvd(folder, first)
+            self._folder.clear(first)
         if shown.vtu:
-            observers.members.append(VtuWriter(folder, sim.scene, self._first or 0, shown.errors))
-        sampler, pictures = Sampler(sim.scene, values), None
+            observers.members.append(VtuWriter(folder, sim.scene, first, shown.errors))
+        sampler, pictures = Sampler(sim.scene, values), []
         look = digest([to_json([asdict(shown.picture), sampler.drawn.looks()])])
         if shown.pictures:
             if self._first is not None and look != self._notes.get("look", look):
                 again = f"`taisoft draw {self.path}` draws all of them alike"
-                print(f"taisoft: pictures differ in size or look from those before frame {self._first}: {again}", file=sys.stderr)
+                print(f"taisoft: pictures differ in size or look from those before frame {first}: {again}", file=sys.stderr)
             n_pictures = round((seconds - (0.0 if self._resumed is None else self._resumed["time"])) * (fps or 1.0 / sim.dt))
             options = replace(shown.picture, bar=has_bar(shown.picture.colour), kept=self._notes)
-            pictures = open_pictures(folder, sampler.drawn, options, plots, n_pictures)
-            self._checkpoints.before.append(pictures.flush)
-        if pictures is not None or keep:
-            members, looks = [] if pictures is None else [pictures], (shown.picture.layers, shown.picture.colour)
-            states = StateWriter(folder, sampler, keep, members, looks, name)
-            observers.members.append(states)
-            self._checkpoints.before.append(states.flush)
+            pictures = [open_pictures(folder, sampler.drawn, options, plots, n_pictures)]
+        if pictures or keep:
+            looks = shown.picture.layers, shown.picture.colour
+            observers.members.append(StateWriter(folder, sampler, keep, pictures, looks, name))
         noted = {"fps": fps, "look": look, "keep": list(keep)}
-        self._checkpoints.notes = lambda: noted | (pictures.kept(sim.time) if pictures else {})
-        observers.members.append(self._checkpoints)
+        self._notes_of = lambda: noted | (pictures[0].kept(sim.time) if pictures else {})
+        self._flush_others = observers.flush
+        observers.members.append(self)
+
+    def frame(self, sim, _index: int) -> None:
+        """Write a checkpoint if one is due."""
+        if self._saved is None:
+            self._saved = sim.time
+        elif self._every is not None and sim.time - self._saved >= self._every * (1.0 - 1e-9):
+            self._flush_others()  # no file may be older
+            self.checkpoint(sim)
 
     def checkpoint(self, sim) -> None:
-        """Write checkpoint.npz. Raises OutputError."""
-        self._checkpoints.write(sim)
+        """Write checkpoint.npz. Raises OutputError; the existing one then remains."""
+        sim.save_checkpoint(self._folder.path / CHECKPOINT_NAME, self._notes_of())
+        self._saved = sim.time
 
     def video(self, fps: float) -> None:
         """Write video.mp4 from the pictures, as `make_video`. Raises OutputError."""
         make_video(self._folder.path, fps)
 
     def report(self, result: RunReport, sim, settings: dict) -> None:
-        """Write report.json and steps.csv, and remove files left by an earlier run. Raises OutputError."""
+        """Write report.json and steps.csv. Raises OutputError."""
         write_report(
             self._folder.path,
             result,
@@ -221,7 +228,6 @@ class Recording:
             bodies=body_records(sim.scene),
             buffer_growths=sim.buffer_growths,
         )
-        self._folder.discard_stale()
 
     def files(self) -> list[str]:
         """Return the contents of the folder: one text per file, and one for each folder of frames."""
@@ -232,8 +238,8 @@ class Recording:
                 found.append(f"{self.path / name}/ ({len(files)} {what}, {_size(files)})")
         return found
 
-    def close(self) -> None:
-        """Release the folder."""
+    def release(self) -> None:
+        """Let others write to the folder."""
         self._folder.close()
 
 

@@ -8,7 +8,7 @@ import os
 import sys
 import tomllib
 from argparse import Namespace
-from contextlib import ExitStack, closing, suppress
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -267,7 +267,7 @@ def _run(sim, settings: RunSettings, arguments, signals, warned: list[str], save
         signals.run_began()
         if arguments.out is not None:
             recording = Recording(arguments.out, arguments.overwrite, resumed, arguments.checkpoint_every, notes)
-            stack.enter_context(closing(recording))
+            stack.callback(recording.release)
         stack.callback(observers.close)
         if shown.window:
             from taisoft.view.window import LiveWindow

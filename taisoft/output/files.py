@@ -1,12 +1,12 @@
-"""The output folder of a run, and its checkpoint. The folder has one writer; its files are complete or absent.
+"""The output folder of a run, and what observes its frames. The folder has one writer; its files are complete or absent.
 
 The folder's lock is an advisory kernel lock (flock) on a file that holds the writer's process id. The kernel releases it when
-the writer dies. `checkpoint.npz` is the run's last good state, written at its end and, if requested, at intervals before.
+the writer dies.
 """
 
 import os
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -14,10 +14,9 @@ from taisoft.errors import OutputError
 from taisoft.files import part_path
 
 LOCK_NAME = "taisoft.lock"
-CHECKPOINT_NAME, PVD_NAME = "checkpoint.npz", "scene.pvd"
+CHECKPOINT_NAME, PVD_NAME, REPORT = "checkpoint.npz", "scene.pvd", "report.json"
 DRAWN_NAME = "drawn"  # folder of the pictures of `taisoft draw`, in that of the run
-RESULT_FILES = ("report.json", "steps.csv", "frames.csv", "scene.usdc", PVD_NAME, CHECKPOINT_NAME, "video.mp4", "drawn/video.mp4")
-REPORT_FILES = ("report.json", "steps.csv", PVD_NAME)  # removed at once: beside another run's results they would be wrong
+RESULT_FILES = (REPORT, "steps.csv", "frames.csv", "scene.usdc", PVD_NAME, CHECKPOINT_NAME, "video.mp4", "drawn/video.mp4")
 # Left by a killed writer: see `taisoft.files.part_path`; USD adds temporary files with a suffix of its own
 TEMPORARY = re.compile(r"\.\d+-\d+\.part$|\.usdc\.\d+-\d+\.[A-Za-z0-9]{6}$")
 # folder -> pattern of a run's files in it, one for each frame or chunk of frames
@@ -45,21 +44,19 @@ def make_folder(path: str | Path) -> Path:
     return path
 
 
-def check_free(path: str | Path, overwrite: bool) -> dict:
-    """Return the results in a folder, by name, without changing it. Raises OutputError if there are any and not overwrite."""
-    found = _results(Path(path)) if Path(path).is_dir() else {}
-    if found and not overwrite:
+def check_free(path: str | Path, overwrite: bool) -> None:
+    """Raise OutputError if a folder holds results, unless they may be overwritten; change nothing."""
+    found = _results(Path(path)) if Path(path).is_dir() and not overwrite else []
+    if found:
         raise OutputError(
             f"the output folder {path} already holds results ({', '.join(found)}): name another, or overwrite it (--overwrite)"
         )
-    return found
 
 
 class OutputFolder:
     """A run's folder: created or reused, checked, and locked until `close`.
 
-    path: created if absent; an empty folder, or one without a run's files, is accepted. overwrite: accept a folder that holds
-    results: REPORT_FILES and RESULT_FOLDERS are removed at once, every other file when its successor is complete.
+    path: created if absent; an empty folder, or one without a run's files, is accepted. overwrite: results in it are removed.
     first: number of the first frame of a resumed run; results are accepted, earlier frames stay, `clear` removes later ones
     and report.json, and other files are only replaced. Raises OutputError if the folder cannot be written, another process
     writes to it, or it holds results without overwrite.
@@ -70,33 +67,41 @@ class OutputFolder:
         self._lock = FolderLock(self.path)
         try:
             with output_errors(f"cannot write to the output folder {path}"):
-                self._old = check_free(path, overwrite) if first is None else {}
-                _clear_parts(self.path)
                 if first is None:
-                    _remove(self.path, *REPORT_FILES)
-                    _clear_frames(self.path, 0)
+                    check_free(path, overwrite)
+                    self.clear(0, RESULT_FILES)
+                _clear_parts(self.path)
                 _probe(self.path)
         except BaseException:
             self.close()
             raise
 
-    def clear(self, first: int) -> None:
-        """Remove report.json, and an earlier run's frames and chunks from number `first` on. Raises OutputError."""
+    def clear(self, first: int, files: Iterable[str] = (REPORT,)) -> None:
+        """Remove files, and an earlier run's frames and chunks from number `first` on. Raises OutputError."""
         with output_errors(f"cannot write to the output folder {self.path}"):
-            _remove(self.path, "report.json")
+            for name in files:
+                if not (self.path / name).is_dir():  # which `_probe` reports
+                    (self.path / name).unlink(missing_ok=True)
             _clear_frames(self.path, first)
-
-    def discard_stale(self) -> None:
-        """Remove an earlier run's result files that this run did not replace, so that the folder holds one run."""
-        for name, identity in self._old.items():
-            file = self.path / name
-            if identity is not None and file.exists() and _identity(file) == identity:
-                with output_errors(f"cannot remove the earlier run's {file}"):
-                    file.unlink()
 
     def close(self) -> None:
         """Release the lock. A second call does nothing."""
         self._lock.close()
+
+
+class Observer:
+    """What gets the frames of a run."""
+
+    def frame(self, sim, index: int) -> None:
+        """Take sim's present state as frame number index. Raises OutputError."""
+        raise NotImplementedError
+
+    def flush(self) -> None:
+        """Write what waits to be written. Raises OutputError."""
+
+    def close(self) -> None:
+        """Write what waits, and end; a second call does nothing. Raises OutputError."""
+        self.flush()
 
 
 class FolderLock:
@@ -134,16 +139,10 @@ class FolderLock:
             self._descriptor = None
 
 
-def _identity(file: Path) -> tuple[int, int]:
-    """Return inode and modification time, which tell a file from its successor (an inode alone may be reused)."""
-    status = file.stat()
-    return status.st_ino, status.st_mtime_ns
-
-
-def _results(folder: Path) -> dict[str, tuple[int, int] | None]:
-    """Return an earlier run's results: file name -> identity, and subfolder name -> None."""
-    files = {name: _identity(folder / name) for name in RESULT_FILES if (folder / name).exists()}
-    return files | {f"{name}/": None for name, pattern in RESULT_FOLDERS.items() if any((folder / name).glob(pattern))}
+def _results(folder: Path) -> list[str]:
+    """Return the names of an earlier run's files, and of its subfolders."""
+    files = [name for name in RESULT_FILES if (folder / name).exists()]
+    return files + [f"{name}/" for name, pattern in RESULT_FOLDERS.items() if any((folder / name).glob(pattern))]
 
 
 def _clear_frames(folder: Path, first: int) -> None:
@@ -153,13 +152,6 @@ def _clear_frames(folder: Path, first: int) -> None:
             number = file.stem.removeprefix("points_")
             if first == 0 or (number.isdecimal() and int(number) >= first):
                 file.unlink()
-
-
-def _remove(folder: Path, *names: str) -> None:
-    """Remove files that exist; folders of these names are left for `_probe` to report."""
-    for name in names:
-        if not (folder / name).is_dir():
-            (folder / name).unlink(missing_ok=True)
 
 
 def _clear_parts(folder: Path) -> None:
@@ -184,34 +176,3 @@ def _probe(folder: Path) -> None:
         part.write_bytes(b"taisoft\n")
     finally:
         part.unlink(missing_ok=True)
-
-
-class CheckpointWriter:
-    """Observer that writes folder/checkpoint.npz.
-
-    every: simulated time between checkpoints, which are written at frames [s]; None: only at the end. before: functions called
-    before each checkpoint at an interval, to flush the run's other files. notes: returns data to store with the state.
-    """
-
-    def __init__(self, folder: str | Path, every: float | None = None):
-        self.path, self.every = Path(folder) / CHECKPOINT_NAME, every
-        self.before: list[Callable[[], None]] = []
-        self.notes: Callable[[], dict] = dict
-        self._last: float | None = None  # simulated time of the last checkpoint, or of the start
-
-    def frame(self, sim, _index: int) -> None:
-        """Write a checkpoint if one is due. Raises OutputError."""
-        if self._last is None:
-            self._last = sim.time
-        elif self.every is not None and sim.time - self._last >= self.every * (1.0 - 1e-9):
-            for flush in self.before:
-                flush()
-            self.write(sim)
-
-    def write(self, sim) -> None:
-        """Write sim's present state. Raises OutputError; the existing checkpoint then remains."""
-        sim.save_checkpoint(self.path, self.notes())
-        self._last = sim.time
-
-    def close(self) -> None:
-        """Do nothing; part of the observer interface."""

@@ -9,13 +9,13 @@ from pathlib import Path
 
 from taisoft.errors import OutputError
 from taisoft.files import write_bytes
-from taisoft.output.files import PVD_NAME, make_folder
+from taisoft.output.files import PVD_NAME, Observer, make_folder
 from taisoft.output.vtu import ENDING, Grid, vtk_file
 
 VTU_NAME = "vtu"  # folder
 
 
-class VtuWriter:
+class VtuWriter(Observer):
     """Observer that writes folder/vtu/<index>.vtu, and folder/scene.pvd, which ParaView opens as a film.
 
     folder: the run's folder; scene: its meshes and names are read at construction; first: number of the first frame of a resumed
@@ -33,9 +33,6 @@ class VtuWriter:
         write_bytes(self._folder / VTU_NAME / f"{index:05d}{ENDING}", self._grid.encoded(sim, self._errors))
         self._times[index] = sim.time
         _write_pvd(self._folder, self._times)
-
-    def close(self) -> None:
-        """Do nothing; part of the observer interface."""
 
 
 def cut_pvd(folder: Path, first: int) -> None:

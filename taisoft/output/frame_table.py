@@ -7,13 +7,14 @@ from pathlib import Path
 from scipy.spatial.transform import Rotation
 
 from taisoft.files import write_bytes
+from taisoft.output.files import Observer
 from taisoft.output.report import csv_text, read_table
 
 TABLE_NAME = "frames.csv"
 POSE = (*((axis, " [m]") for axis in "xyz"), *((f"q{part}", "") for part in "wxyz"))  # columns and units
 
 
-class FrameTable:
+class FrameTable(Observer):
     """Observer that writes folder/frames.csv, whole at each `flush` and at the end.
 
     folder: the run's folder; scene: one that `needed` is true of; first: number of the first frame of a resumed run, before
@@ -50,5 +51,3 @@ class FrameTable:
     def flush(self) -> None:
         """Write the rows so far. Raises OutputError."""
         write_bytes(self.path, csv_text([self._header, *self._rows]).encode())
-
-    close = flush

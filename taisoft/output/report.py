@@ -24,6 +24,7 @@ from taisoft.errors import OutputError, reason
 from taisoft.files import write_bytes
 from taisoft.machine import processor
 from taisoft.machine import versions as installed
+from taisoft.output.files import Observer
 from taisoft.records import RunReport, StepReport, headings
 
 PACKAGES = ("taichi", "numpy", "scipy", "usd-core")
@@ -220,7 +221,7 @@ class Bar:
             self._bar = None
 
 
-class Progress(Bar):
+class Progress(Bar, Observer):
     """Observer that shows the progress of a run of `seconds` [s] of simulated time on a stream (stderr by default): a Bar with
     steps/s and the remaining time."""
 

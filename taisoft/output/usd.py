@@ -27,7 +27,7 @@ from taisoft.dynamics.readout import nodal_impulses
 from taisoft.errors import OutputError
 from taisoft.files import replacing
 from taisoft.mesh.usd_content import usd_message
-from taisoft.output.files import make_folder, output_errors
+from taisoft.output.files import Observer, make_folder, output_errors
 from taisoft.output.nodal_fields import UNKNOWN_ERROR, NodalValues
 from taisoft.output.usd_curves import TENSION
 from taisoft.output.usd_scene import OF_CAMERA, scene_layer
@@ -40,7 +40,7 @@ INSTANT = 0.01  # of a frame: the time over which the velocity of an obstacle on
 TIME_VARYING = {"points", "extent", VELOCITIES, NORMALS, STRESS, IMPULSE, ERROR, f"primvars:{TENSION}", *OF_CAMERA}  # attributes
 
 
-class UsdWriter:
+class UsdWriter(Observer):
     """Observer that writes the scene's bodies, obstacles, springs and tendons over time to folder/scene.usdc.
 
     folder: the run's folder; scene: its meshes and names are read at construction; fps: frames per second of simulated time

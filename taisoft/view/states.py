@@ -17,7 +17,7 @@ from taisoft.errors import OutputError, TaisoftError, reason
 from taisoft.files import replacing
 from taisoft.nested import join_arrays, part_arrays
 from taisoft.output.background import BackgroundWriter
-from taisoft.output.files import make_folder
+from taisoft.output.files import Observer, make_folder
 from taisoft.scene import checks
 from taisoft.scene.look import Camera, check_follow, colour_of, opacity_of
 from taisoft.scene.scene import Scene
@@ -33,7 +33,7 @@ KEPT = ("stress", "speed")  # quantities that a run keeps by default
 DISPLACEMENT, VALUES = "displacement", "values"  # arrays over the nodes; the latter followed by a quantity's name
 
 
-class StateWriter:
+class StateWriter(Observer):
     """Observer that samples every frame once, writes its state to the run's folder, and passes it on.
 
     kinds: quantities that are kept, besides positions; without any no states are written. members: get `frame(state, index)`;
@@ -62,8 +62,9 @@ class StateWriter:
             member.frame(state, index)
 
     def flush(self) -> None:
-        """Wait until all states are written. Raises OutputError."""
-        self._writer.flush()
+        """Wait until all states, and what the members write, are written. Raises OutputError."""
+        for one in (*self.members, self._writer):
+            one.flush()
 
     def close(self) -> None:
         """Write the states that wait, and close the members; a second call does nothing. Raises OutputError."""

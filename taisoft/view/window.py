@@ -11,6 +11,7 @@ import warnings
 
 from taisoft.errors import OutputError
 from taisoft.frames import dt_sentence, fit_dt
+from taisoft.output.files import Observer
 from taisoft.records import RunReport, StepReport
 from taisoft.view.controls import touching_pairs
 from taisoft.view.ggui import display_missing, vulkan_missing
@@ -118,7 +119,7 @@ class WindowProcess(Viewer):
         super().close()
 
 
-class LiveWindow:
+class LiveWindow(Observer):
     """A window that shows a simulation while a loop of the caller steps it: call it with the simulator for each picture.
 
     `sim.run(seconds, on_frame=window)` does so for each frame. colour and layers: as for `show`. A window that is closed or lost

@@ -24,7 +24,7 @@ from pxr import Sdf, Usd
 import taisoft as ts
 from taisoft import simulator
 from taisoft.checkpoint import read_checkpoint
-from taisoft.output.files import CheckpointWriter, OutputFolder
+from taisoft.output.files import OutputFolder
 from tests.backend.lanes import opened
 from tests.cli.command import BEAM, LED, ROOT, report, run, write
 from tests.output.png import decode
@@ -172,7 +172,6 @@ from pathlib import Path
 import numpy as np
 from tests.view.fake_simulator import beam_scene
 from taisoft.checkpoint import read_checkpoint, write_checkpoint
-from taisoft.output.files import CheckpointWriter
 from taisoft.output.report import write_report
 from taisoft.records import RunReport, StepReport
 
@@ -184,10 +183,10 @@ class Saved:
         write_checkpoint(path, {}, scene, {}, {"n": self.time, "x": np.full(20_000, self.time)}, notes)
 
 def replace(kill, begun):
-    sim, writer = Saved(), CheckpointWriter(folder)
+    sim = Saved()
     for k in range(1_000_000):
         sim.time = 1000.0 * kill + k
-        writer.write(sim)
+        sim.save_checkpoint(folder / "checkpoint.npz", {})
         reports = [StepReport(time=0.01 * j) for j in range(k % 50)]
         write_report(folder, RunReport(steps=k, step_reports=reports), arch="cpu", precision="f32", settings={}, plan=[])
         if k == 0:
@@ -299,7 +298,7 @@ def test_nan_during_a_run(tmp_path, monkeypatch):
     scene = ts.Scene()
     scene.add_body(ts.box_mesh((2, 1, 1), (2, 1, 1)), ts.Material(young=1e5), name="part")
     scene.add_obstacle(ts.HalfSpace((0, -0.55, 0), (0, 1, 0)))
-    checkpoints, shown = CheckpointWriter(tmp_path, every=0.001), []
+    path, shown = tmp_path / "checkpoint.npz", []
 
     class FaultyDynamics(simulator.Dynamics):
         def advance(self, n):
@@ -310,7 +309,7 @@ def test_nan_during_a_run(tmp_path, monkeypatch):
             return super().advance(n)
 
     def observe(sim, index, report):
-        checkpoints.frame(sim, index)
+        sim.save_checkpoint(path)
         shown.append(sim.positions())
 
     monkeypatch.setattr(simulator, "Dynamics", FaultyDynamics)
@@ -320,6 +319,6 @@ def test_nan_during_a_run(tmp_path, monkeypatch):
         assert re.search(r"^step 3: body 'part', node 5: position, velocity or force is no longer finite", result.problems[-1])
         assert np.array_equal(sim.positions(), shown[-1])
         with pytest.raises(ts.SimulationError, match="written of a state that is not finite: body 'part', node 5"):
-            checkpoints.write(sim)
-    simulation = read_checkpoint(tmp_path / "checkpoint.npz").state["simulation"]
+            sim.save_checkpoint(path)
+    simulation = read_checkpoint(path).state["simulation"]
     assert simulation["step_count"] == 2 and np.array_equal(simulation["x"], shown[-1]) and np.isfinite(simulation["v"]).all()

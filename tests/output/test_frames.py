@@ -128,7 +128,7 @@ def test_command_is_printed_without_ffmpeg(tmp_path, monkeypatch, capsys):
     assert not capsys.readouterr().err  # no pictures
     write_pictures(out)
     recording.video(30.0)
-    recording.close()
+    recording.release()
     errors, command = capsys.readouterr().err, shlex.join(ffmpeg_command(out, 30.0))
     assert "pip install 'taisoft[video]'" in errors and command in errors and "-framerate 30 " in command
     with pytest.raises(OutputError, match="cannot be made without ffmpeg"):
