@@ -77,7 +77,7 @@ def begin(title: str, *how: str, packages: tuple[str, ...] = ("taichi", "numpy",
 
 def header(title: str, *how: str, packages: tuple[str, ...] = ("taichi", "numpy", "scipy")) -> tuple[str, dict]:
     """Title, machine, date and versions, as text and as data."""
-    found = machine() | {"date": datetime.now().isoformat(timespec="minutes")}
+    found = machine() | {"load": load_average(), "date": datetime.now().isoformat(timespec="minutes")}
     numbers = found | {"versions": {"taisoft": ts.__version__, **versions(*packages)}}
     return header_text(title, numbers, *how), numbers
 

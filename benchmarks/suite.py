@@ -134,7 +134,7 @@ def runs_of(name: str, options: argparse.Namespace, *files: str) -> Iterator[Run
     """
     child = ("-m", "taisoft", "bench", name, "--child")
     found = [path for pattern in files for path in Path(__file__).parent.glob(pattern)]
-    on = [machine() | {"load": None}, code_digest(), files_digest(found)]
+    on = [machine(), code_digest(), files_digest(found)]
     folder = options.keep and make_folder(options.keep)
     lock = closing(FolderLock(folder)) if folder else nullcontext()
     with Signals("ending; runs that are finished are kept") as signals, lock:

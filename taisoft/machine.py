@@ -6,6 +6,7 @@ refused before allocation.
 
 import os
 import platform
+import sys
 from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import dataclass
@@ -14,9 +15,11 @@ from pathlib import Path
 
 import numpy as np
 
+from taisoft import __version__
 from taisoft.errors import OutputError, SimulationError, TaisoftError
 
 THREADS, MAX_THREADS = "TAISOFT_THREADS", 1024
+PACKAGES = ("taichi", "numpy", "scipy", "usd-core")  # that results depend on
 
 
 @dataclass(frozen=True)
@@ -44,14 +47,15 @@ def load_average() -> float | None:
     return os.getloadavg()[0] if hasattr(os, "getloadavg") else None
 
 
-def machine() -> dict:
-    """Processor name, number of cores this process may use, operating system and present load."""
-    return {"processor": processor(), "cores": len(usable_cores()), "system": platform.platform(), "load": load_average()}
+def machine(named: bool = False) -> dict:
+    """Name of the processor, number of cores this process may use, operating system; named: and the machine's name in its net."""
+    found = {"processor": processor(), "cores": len(usable_cores()), "system": platform.platform()}
+    return found | ({"name": platform.node()} if named else {})
 
 
 def versions(*packages: str) -> dict[str, str | None]:
-    """Version of Python and of each package; None if a package is not installed."""
-    found: dict[str, str | None] = {"python": platform.python_version()}
+    """Version of Python, of taisoft and of each package; None if a package is not installed."""
+    found: dict[str, str | None] = {"python": platform.python_version(), "taisoft": __version__}
     for package in packages:
         try:
             found[package] = metadata.version(package)
@@ -91,6 +95,16 @@ _CGROUPS = (
     ("memory.max", "memory.current", "memory.stat", "inactive_file"),
     ("memory/memory.limit_in_bytes", "memory/memory.usage_in_bytes", "memory/memory.stat", "total_inactive_file"),
 )
+
+
+def peak_memory() -> int | None:
+    """Largest resident size of this process so far [bytes]; None if the system does not report it."""
+    try:
+        import resource
+    except ImportError:  # not a POSIX system
+        return None
+    unit = 1 if sys.platform == "darwin" else 1024
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit
 
 
 def available_memory() -> int | None:

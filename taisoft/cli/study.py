@@ -14,12 +14,11 @@ from pathlib import Path
 from taisoft.cli import EXIT_FAILED, EXIT_SIGNAL, Interrupted, Signals, parse_scalar
 from taisoft.cli.scene_file import check_scene_solver, find_scene, load_scene
 from taisoft.errors import SceneError, TaisoftError, reworded
-from taisoft.machine import usable_cores
+from taisoft.machine import machine, usable_cores
 from taisoft.many.cluster import cluster_places, connect
 from taisoft.many.places import LocalPlace
 from taisoft.many.store import Store, code_digest, digests, sources
 from taisoft.output.files import FolderLock, check_free, make_folder
-from taisoft.output.report import machine
 from taisoft.processes import serve
 from taisoft.scene import checks
 from taisoft.scene.checks import check_solver
@@ -79,7 +78,7 @@ def check_device(plan: dict, workers: int) -> None:
 def _places(arguments: Namespace, request: Request, stack: ExitStack) -> tuple[list, list[dict]]:
     """Return the places that execute runs, and their machines."""
     if arguments.scheduler is None:
-        return local_places(1 if arguments.workers is None else arguments.workers), [machine()]
+        return local_places(1 if arguments.workers is None else arguments.workers), [machine(named=True)]
     if arguments.workers is not None:
         raise SceneError("--workers sets this machine's processes, and --scheduler has its own workers: give one of them")
     client = stack.enter_context(closing(connect(arguments.scheduler, "--scheduler")))

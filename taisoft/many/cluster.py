@@ -10,9 +10,8 @@ import uuid
 from contextlib import suppress
 
 from taisoft.errors import SceneError
-from taisoft.machine import require, usable_cores
+from taisoft.machine import machine, require, usable_cores
 from taisoft.many.places import POLL_INTERVAL, LocalPlace
-from taisoft.output.report import machine
 
 CONNECT_SECONDS = 10  # to a cluster's scheduler
 ALIVE_CHECK_INTERVAL = 2.0  # [s]
@@ -74,7 +73,7 @@ def stop_on_worker(name: str) -> None:
 
 
 def _worker_info() -> dict:
-    return {"machine": machine(), "cores": usable_cores()}
+    return {"machine": machine(named=True), "cores": usable_cores()}
 
 
 def connect(address: str, argument: str):

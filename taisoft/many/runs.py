@@ -18,14 +18,14 @@ import numpy as np
 from taisoft import processes
 from taisoft.errors import OutputError, SceneError, value_text
 from taisoft.files import write_bytes
-from taisoft.machine import THREADS, thread_count, usable_cores
+from taisoft.machine import PACKAGES, THREADS, machine, thread_count, usable_cores, versions
 from taisoft.many.cluster import cluster_places, connect
 from taisoft.many.make import COLUMNS, Make, make_of
 from taisoft.many.places import LocalPlace, Place, carry_out
 from taisoft.many.results import Results, Row
 from taisoft.many.store import Store, digest, digests
 from taisoft.output.files import FolderLock, check_free, make_folder
-from taisoft.output.report import Bar, clock_text, json_text, machine, versions
+from taisoft.output.report import Bar, clock_text, json_text
 from taisoft.scene import checks
 
 CHILD = ("-m", "taisoft.many.make")
@@ -186,7 +186,12 @@ class Many:
                 results = self.results()
                 results.write(out / TABLE)
                 record = {"kind": KIND, "make": self._make.name, "runs": total, "status": results.counts(), "processes": how}
-                record |= {"notes": self._notes, "versions": versions(), "machine": machine(), "digest": results.digest()}
+                record |= {
+                    "notes": self._notes,
+                    "versions": versions(*PACKAGES),
+                    "machine": machine(named=True),
+                    "digest": results.digest(),
+                }
                 write_bytes(out / REPORT, json_text(record).encode())
 
     def _reuse(self) -> None:

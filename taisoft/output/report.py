@@ -10,8 +10,6 @@ import dataclasses
 import io
 import json
 import math
-import os
-import platform
 import sys
 import time
 from collections.abc import Callable, Iterable
@@ -22,12 +20,10 @@ import numpy as np
 
 from taisoft.errors import OutputError, reason
 from taisoft.files import write_bytes
-from taisoft.machine import processor
-from taisoft.machine import versions as installed
+from taisoft.machine import PACKAGES, machine, peak_memory, versions
 from taisoft.output.files import Observer
 from taisoft.records import RunReport, StepReport, headings
 
-PACKAGES = ("taichi", "numpy", "scipy", "usd-core")
 LINE_EVERY = 5.0  # time between lines of progress if the stream is not a terminal [s]
 COLUMNS = [f.name for f in dataclasses.fields(StepReport) if f.name != "details"]
 NUMERIC = [f.name for f in dataclasses.fields(StepReport) if f.type in (int, float) and f.name != "time"]
@@ -56,7 +52,7 @@ def write_report(folder: str | Path, result: RunReport, *, resumed: dict | None 
     write_bytes(folder / "steps.csv", steps_csv(result.step_reports, earlier).encode())
     record = {f.name: getattr(result, f.name) for f in dataclasses.fields(result) if f.name != "step_reports"}
     record |= {"extremes": extremes(result.step_reports), "resumed": resumed, **entries}
-    record |= {"versions": versions(), "machine": machine(), "peak_memory_bytes": peak_memory()}
+    record |= {"versions": versions(*PACKAGES), "machine": machine(named=True), "peak_memory_bytes": peak_memory()}
     write_bytes(folder / "report.json", json_text(record).encode())
 
 
@@ -139,29 +135,6 @@ def read_table(path: Path, is_kept: Callable[[list[str]], bool]) -> tuple[list[s
 def json_text(record: dict) -> str:
     """Return the record as standard JSON text: numbers that are not finite become null."""
     return json.dumps(_plain(record), indent=1, allow_nan=False) + "\n"
-
-
-def versions() -> dict[str, str | None]:
-    """Return the versions of Python, taisoft and the packages used by a run; None if unknown."""
-    import taisoft
-
-    found = installed(*PACKAGES)
-    return {"python": found.pop("python"), "taisoft": taisoft.__version__} | found
-
-
-def machine() -> dict:
-    """Return the machine's name, system, processor and number of logical cores."""
-    return {"name": platform.node(), "system": platform.platform(), "cpu": processor(), "cores": os.cpu_count()}
-
-
-def peak_memory() -> int | None:
-    """Return the largest resident size of this process so far [bytes]; None if the system does not report it."""
-    try:
-        import resource
-    except ImportError:  # not a POSIX system
-        return None
-    unit = 1 if sys.platform == "darwin" else 1024
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit
 
 
 def _plain(value):

@@ -8,9 +8,9 @@ from taisoft.backend import runtime
 from taisoft.errors import SimulationError, TaisoftError, collected_warnings
 from taisoft.fem.loads import SceneLoads
 from taisoft.fem.reference import gravity_mass, lumped_mass
-from taisoft.machine import load_average, usable_cores
+from taisoft.machine import PACKAGES, load_average, machine, peak_memory, usable_cores, versions
 from taisoft.mesh.quality import edge_lengths
-from taisoft.output.report import extremes, machine, peak_memory, versions
+from taisoft.output.report import extremes
 from taisoft.scene.scene import Scene
 from taisoft.simulator import Simulator
 from taisoft.study import simulator_arguments
@@ -27,7 +27,8 @@ def measure(scene: Scene, task: dict) -> dict:
     number of timed runs, 0 for none).
     """
     setting = simulator_arguments(task["setting"])
-    record = {"task": task, "machine": machine(), "versions": versions(), "cores": usable_cores(), "load": load_average()}
+    record = {"task": task, "machine": machine(named=True), "versions": versions(*PACKAGES)}
+    record |= {"cores": usable_cores(), "load": load_average()}
     record |= _scene_facts(scene, task)
     with collected_warnings() as record["warnings"]:
         record |= _run(scene, setting | task["fixed"], task)

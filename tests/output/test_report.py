@@ -70,7 +70,7 @@ def test_the_report_holds_the_run(written):
     assert (extremes["force x [N]"]["min"], extremes["force x [N]"]["max"]) == (-2.0, 0.0)
     assert record["versions"]["python"] == platform.python_version()
     assert all(record["versions"][package][0].isdigit() for package in ("taisoft", "taichi", "numpy", "scipy", "usd-core"))
-    assert record["machine"]["cores"] >= 1 and record["machine"]["cpu"] and record["machine"]["name"] == platform.node()
+    assert record["machine"]["cores"] >= 1 and record["machine"]["processor"] and record["machine"]["name"] == platform.node()
     assert 10e6 < record["peak_memory_bytes"] < 1e12  # a Python with NumPy: tens of megabytes at least
 
 
