@@ -16,6 +16,7 @@ import taisoft as ts
 from taisoft.errors import OutputError
 from taisoft.files import write_bytes
 from taisoft.machine import Timing, load_average, machine, summarise, versions
+from taisoft.output import tables
 from taisoft.output.files import make_folder
 from taisoft.output.report import json_text
 from taisoft.output.tables import markdown, percent, spread_of
@@ -153,13 +154,8 @@ Columns = Sequence[tuple[str, str | Callable[..., str]]]
 
 
 def table(rows: Iterable, columns: Columns, notes: Iterable[str] = ()) -> str:
-    """A Markdown table, with the notes as bullets below.
-
-    columns: (heading, cell); a heading that starts with "<" is left-aligned, a cell is a format string or a function of the row.
-    """
-    lines = [[cell.format(row) if isinstance(cell, str) else cell(row) for _, cell in columns] for row in rows]
-    left = [k for k, (heading, _) in enumerate(columns) if heading.startswith("<")]
-    text = markdown([heading.removeprefix("<") for heading, _ in columns], lines, left)
+    """A Markdown table, as of `taisoft.output.tables`, with the notes as bullets below."""
+    text = tables.table(rows, columns)
     bullets = "".join(f"\n* {note}" for note in notes)
     return f"{text}\n{bullets}" if bullets else text
 

@@ -12,8 +12,7 @@ import numpy as np
 from taisoft.errors import SceneError, listed, one_line
 from taisoft.files import write_bytes
 from taisoft.many.store import digest
-from taisoft.output.report import csv_text
-from taisoft.output.tables import markdown
+from taisoft.output.tables import csv_text, markdown
 from taisoft.scene.checks import nearest
 
 ROWS_SHOWN = 20

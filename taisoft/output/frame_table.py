@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from taisoft.files import write_bytes
 from taisoft.output.files import Observer
-from taisoft.output.report import csv_text, read_table
+from taisoft.output.tables import csv_text, read_table
 
 TABLE_NAME = "frames.csv"
 POSE = (*((axis, " [m]") for axis in "xyz"), *((f"q{part}", "") for part in "wxyz"))  # columns and units

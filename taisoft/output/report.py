@@ -5,14 +5,11 @@ its details in further columns, where a pair that did not press in a step has ze
 JSON has no NaN: numbers that are not finite are null there, and counted in the extremes.
 """
 
-import csv
 import dataclasses
-import io
 import json
 import math
 import sys
 import time
-from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TextIO
 
@@ -22,6 +19,7 @@ from taisoft.errors import OutputError, reason
 from taisoft.files import write_bytes
 from taisoft.machine import PACKAGES, machine, peak_memory, versions
 from taisoft.output.files import Observer
+from taisoft.output.tables import csv_text, read_table
 from taisoft.records import RunReport, StepReport, headings
 
 LINE_EVERY = 5.0  # time between lines of progress if the stream is not a terminal [s]
@@ -113,23 +111,6 @@ def steps_csv(reports: list[StepReport], earlier: tuple[list[str], list[list[str
     records = (report.to_dict() for report in reports)
     own_rows = ([row.get(name, 0.0 if name.split()[0] in asked else "") for name in columns] for row in records)
     return csv_text([columns, *([*row, *filled] for row in rows), *own_rows])
-
-
-def csv_text(rows: Iterable[Iterable]) -> str:
-    """Return rows as CSV text (RFC 4180)."""
-    text = io.StringIO(newline="")
-    csv.writer(text).writerows(rows)
-    return text.getvalue()
-
-
-def read_table(path: Path, is_kept: Callable[[list[str]], bool]) -> tuple[list[str], list[list[str]]]:
-    """Return the header of an earlier run's CSV file and the rows that are kept; nothing if there is no such file."""
-    try:
-        with open(path, newline="", encoding="utf-8") as file:
-            header, *rows = csv.reader(file)
-        return header, [row for row in rows if is_kept(row)]
-    except (OSError, ValueError, IndexError, csv.Error):
-        return [], []
 
 
 def json_text(record: dict) -> str:

@@ -1,7 +1,8 @@
-"""Tables and plots of studies and benchmarks: Markdown that is readable on a terminal, and PNG files by matplotlib."""
+"""Tables of runs, studies and benchmarks: Markdown that is readable on a terminal, and CSV; plots as PNG files by matplotlib."""
 
+import csv
 import io
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
 from taisoft.files import write_bytes
@@ -19,6 +20,33 @@ def markdown(headings: Sequence[str], rows: Iterable[Sequence[str]], left: Seque
 
     rule = "|".join(f" {'-' * w} " if k in left else f" {'-' * (w - 1)}: " for k, w in enumerate(widths))
     return "\n".join([line(lines[0]), f"|{rule}|", *map(line, lines[1:])])
+
+
+def table(rows: Iterable, columns: Sequence[tuple[str, str | Callable[..., str]]]) -> str:
+    """Return a Markdown table of rows.
+
+    columns: (heading, cell); a heading that starts with "<" is left-aligned, a cell is a format string or a function of the row.
+    """
+    lines = [[cell.format(row) if isinstance(cell, str) else cell(row) for _, cell in columns] for row in rows]
+    left = [k for k, (heading, _) in enumerate(columns) if heading.startswith("<")]
+    return markdown([heading.removeprefix("<") for heading, _ in columns], lines, left)
+
+
+def csv_text(rows: Iterable[Iterable]) -> str:
+    """Return rows as CSV text (RFC 4180)."""
+    text = io.StringIO(newline="")
+    csv.writer(text).writerows(rows)
+    return text.getvalue()
+
+
+def read_table(path: Path, is_kept: Callable[[list[str]], bool]) -> tuple[list[str], list[list[str]]]:
+    """Return the header of an earlier run's CSV file and the rows that are kept; nothing if there is no such file."""
+    try:
+        with open(path, newline="", encoding="utf-8") as file:
+            header, *rows = csv.reader(file)
+        return header, [row for row in rows if is_kept(row)]
+    except (OSError, ValueError, IndexError, csv.Error):
+        return [], []
 
 
 def percent(fraction: float | None) -> str:

@@ -5,13 +5,12 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 
 from taisoft.estimation.comparison import Error
-from taisoft.output.report import csv_text
-from taisoft.output.tables import markdown, percent, spread_of
+from taisoft.output.tables import csv_text, percent, spread_of, table
 from taisoft.study import AXES, Request, describe, mesh_name
 from taisoft.study.accuracy import Reference, Row
 
 ALWAYS_SHOWN = ("integrator", "dt")  # axes that have a column even if they do not vary
-LEFT_ALIGNED = ("", "integrator", "status", "precision", "contact solver")
+HEADINGS = {"dt": "dt [s]", "integrator": "<integrator", "precision": "<precision", "contact_solver": "<contact solver"}
 Point = tuple[float, float]  # time, error; smaller is better in both
 
 
@@ -107,28 +106,22 @@ def _answer(study: Study) -> str:
 def _run_table(study: Study, rows: list[Row]) -> str:
     """Return a table with one row per run; * marks the front. Axes that do not vary are left out."""
     front = study.front()
-    columns = {"": lambda r: "*" if r in front else ""}
+    columns = [("<", lambda r: "*" * (r in front))]
     for key in AXES:
         if key in ALWAYS_SHOWN or len({row.setting[key] for row in rows}) > 1:
-            columns["dt [s]" if key == "dt" else key.replace("_", " ")] = lambda r, key=key: _axis(r.setting[key])
-    columns["s/sim. s"] = lambda r: f"{r.timing.median:.3g}" if r.seconds else ""
-    columns["spread"] = lambda r: percent(spread_of(r.timing)) if r.seconds else ""
-    if any(row.in_space is not None for row in rows):
-        titles = {"in_time": ("error in time, max", "rms in time"), "in_space": ("error in space, max", "rms in space")}
-    else:
-        titles = {"in_time": ("error, max", "rms")}
-    for name, pair in titles.items():
-        for title, by in zip(pair, ("max", "rms")):
-            columns[title] = lambda r, name=name, by=by: _error(getattr(r, name), getattr(r, f"{name}_sure"), by)
-    columns["energy drift" if any(row.energy_kept for row in rows) else "energy error"] = lambda r: _number(r.energy)
-    columns["momentum"] = lambda r: _number(r.momentum)
+            columns.append((HEADINGS.get(key, key.replace("_", " ")), lambda r, key=key: _axis(r.setting[key])))
+    columns.append(("s/sim. s", lambda r: f"{r.timing.median:.3g}" if r.seconds else ""))
+    columns.append(("spread", lambda r: percent(spread_of(r.timing)) if r.seconds else ""))
+    in_space = any(row.in_space is not None for row in rows)
+    for name, what in (("in_time", " in time"), ("in_space", " in space")) if in_space else (("in_time", ""),):
+        for heading, by in ((f"error{what}, max", "max"), (f"rms{what}", "rms")):
+            columns.append((heading, lambda r, name=name, by=by: _error(getattr(r, name), getattr(r, f"{name}_sure"), by)))
+    shown = {"energy": "energy drift" if any(row.energy_kept for row in rows) else "energy error", "momentum": "momentum"}
     if study.plan["touching"]:
-        columns["penetration/edge"] = lambda r: _number(r.penetration)
-        columns["contact residual"] = lambda r: _number(r.contact_residual)
-    columns |= {"unconverged": lambda r: _number(r.unconverged), "inverted": lambda r: _number(r.inverted)}
-    columns["status"] = lambda r: r.status
-    left = [k for k, name in enumerate(columns) if name in LEFT_ALIGNED]
-    return markdown(list(columns), [[cell(row) for cell in columns.values()] for row in rows], left=left)
+        shown |= {"penetration": "penetration/edge", "contact_residual": "contact residual"}
+    for name, heading in (shown | {"unconverged": "unconverged", "inverted": "inverted"}).items():
+        columns.append((heading, lambda r, name=name: _number(getattr(r, name))))
+    return table(rows, [*columns, ("<status", lambda r: r.status)])
 
 
 def _method(study: Study) -> str:
