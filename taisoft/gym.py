@@ -13,7 +13,7 @@ from taisoft.output.viewpoint import Viewpoint, framed_points
 from taisoft.records import StepReport
 from taisoft.scene import checks
 from taisoft.scene.scene import Scene
-from taisoft.settings import NAMES, check_count
+from taisoft.settings import NAMES
 from taisoft.simulator import Simulator
 from taisoft.view.colouring import checked_colour
 from taisoft.view.offscreen import Offscreen, checked_size
@@ -101,7 +101,7 @@ class Env(gymnasium.Env):
             if not (isinstance(space, gymnasium.Space) or (space is None and name == "observation_space")):
                 raise SceneError(f"{name} must be a ts.gym.Box or another space of gymnasium, not {value_text(space)}")
         self._apply, self._observe, self._reward, self._terminated, self._start = given.values()
-        self.frame_skip = check_count("frame_skip", frame_skip)
+        self.frame_skip = checks.whole(frame_skip, "frame_skip")
         self.render_mode = render_mode if render_mode is None else checks.choice(render_mode, "render_mode", ("rgb_array",))
         self._size, self._colour = checked_size(size), checked_colour(colour)
         self._drawing: Offscreen | None = None

@@ -2,12 +2,10 @@
 
 import dataclasses
 
-import numpy as np
-
 from taisoft.attributes import guarded_record
 from taisoft.contact import SOLVERS as EXPLICIT_CONTACT
 from taisoft.dynamics.schemes import CHOICES, EXPLICIT, STATIC, is_multistep, takes_contacts
-from taisoft.errors import SceneError, SimulationError
+from taisoft.errors import SceneError, SimulationError, reworded
 from taisoft.scene import checks
 from taisoft.scene.holding import check_held
 from taisoft.scene.plan import Plan, make_plan
@@ -67,12 +65,10 @@ def check_settings(scene: Scene, **given) -> Settings:
         raise SceneError("the scene holds no body")
     scene.check()
     settings = Settings(**given | {"dt": check_dt(given.get("dt", Settings.dt))})
-    try:
+    with reworded(SceneError, raised=SimulationError):
         checks.check_solver(**dataclasses.asdict(settings))
         checks.choice(settings.integrator, "integrator", CHOICES)
         checks.choice(settings.contact_solver, "contact_solver", CONTACT_SOLVERS)
-    except SceneError as error:
-        raise SimulationError(str(error)) from None
     given = {name: value for name in (*TOLERANCES, "tolerance") if (value := getattr(settings, name)) is not None}
     settings = dataclasses.replace(settings, **{name: float(value) for name, value in given.items()})
     _check_contact_solver(settings, scene.pushes(settings.self_collision))
@@ -113,13 +109,6 @@ def check_budget(settings: Settings) -> Settings:
     return dataclasses.replace(
         settings, budget=checks.number(settings.budget, "budget", minimum=0.0, unit="s", error=SimulationError)
     )
-
-
-def check_count(name: str, value) -> int:
-    """Return value as an int; SimulationError unless it is an integer of at least 1."""
-    if isinstance(value, (bool, np.bool_)) or not isinstance(value, (int, np.integer)) or value < 1:
-        raise SimulationError(f"{name} must be an integer of at least 1, not {value!r}")
-    return int(value)
 
 
 def kept_by_multipliers(scene: Scene) -> list[str]:

@@ -14,8 +14,9 @@ from taisoft.estimation.first_choice import settings_for
 from taisoft.fem.laws import lane_law
 from taisoft.output.vtu import to_pyvista, write_vtu
 from taisoft.records import StepReport
+from taisoft.scene import checks
 from taisoft.scene.scene import Scene
-from taisoft.settings import NAMES, Settings, check_count, check_settings, plan_of
+from taisoft.settings import NAMES, Settings, check_settings, plan_of
 from taisoft.stability import scale_warnings
 
 if TYPE_CHECKING:
@@ -117,7 +118,7 @@ class Simulator(Guarded):
 
         Raises SimulationError as `step` does, and unless n is an integer of at least 1.
         """
-        dynamics, n = self._open(), check_count("n", n)
+        dynamics, n = self._open(), checks.whole(n, "n", error=SimulationError)
         report = dynamics.robots.step(dynamics) if dynamics.robots else dynamics.advance(n)
         if self._may_soften and (text := self._dynamics.describe_softening()):
             self._may_soften = False

@@ -20,6 +20,7 @@ from taisoft.fem.fibres import fibre_tangent, start_activation
 from taisoft.fem.loads import SceneLoads
 from taisoft.fem.spring_table import SpringTable, length_and_gradient
 from taisoft.fem.springs import spring_table
+from taisoft.scene import checks
 from taisoft.scene.composition import Composition
 from taisoft.scene.rigid import RigidBody
 from taisoft.scene.scene import Body, Scene
@@ -312,8 +313,7 @@ def modes(scene: Scene, k: int, mass: str = "lumped") -> Modes:
     tendon that is slack there does not. Raises SceneError for an invalid k or mass, and for an inextensible tendon, whose tension
     there is unknown.
     """
-    if mass not in ("lumped", "consistent"):
-        raise SceneError(f"mass '{mass}' is unknown: it must be 'lumped' or 'consistent'")
+    checks.choice(mass, "modes: mass", ("lumped", "consistent"))
     if not scene.bodies:
         raise SceneError("the scene holds no body")
     scene.check()
@@ -326,8 +326,7 @@ def modes(scene: Scene, k: int, mass: str = "lumped") -> Modes:
     if dependents is not None:
         free.reshape(-1, 3)[dependents.node] = False
     n_free = int(free.sum())
-    if isinstance(k, bool) or not isinstance(k, (int, np.integer)) or not 1 <= k <= n_free:
-        raise SceneError(f"k = {k!r}: it must be a whole number from 1 to the {n_free} free axes of the scene")
+    checks.whole(k, f"modes: k, of {n_free} free axes,", range(1, n_free + 1))
     K = sp.block_diag([hooke_stiffness(b) for b in scene.bodies], format="csr")
     table = spring_table(scene, dependents)
     K = K if table is None else K + spring_stiffness(scene, table)

@@ -170,7 +170,7 @@ def solve_static(
             raise SceneError("solve_static: error and quantities need steps, or a scene with contacts")
         at, time = 0.0 if time is None else checks.number(time, "time"), 1.0
     time = 1.0 if time is None else checks.number(time, "time", above=0.0, unit="s")
-    steps = 1 if steps is None else checks.whole(steps, "steps", range(1, 2**31))
+    steps = 1 if steps is None else checks.whole(steps, "steps")
     settings = {
         "newton_tolerance": tolerance,
         "contact_tolerance": contact_tolerance,
@@ -187,8 +187,7 @@ def _check(scene: Scene, tolerance: float) -> None:
     if not isinstance(scene, Scene) or not scene.bodies:
         raise SceneError("solve_static needs a Scene that holds a body")
     scene.check()
-    if isinstance(tolerance, bool) or not isinstance(tolerance, (int, float)) or not 0.0 < tolerance < LOOSEST:
-        raise SceneError(f"tolerance = {tolerance!r}: it must lie between 0 and {LOOSEST:g}")
+    checks.number(tolerance, "tolerance", above=0.0, below=LOOSEST)
 
 
 def _solve(sim: Simulator, time: float, estimate: dict) -> StaticResult:

@@ -7,7 +7,6 @@ from pathlib import Path
 from taisoft.errors import OutputError, SceneError, reworded
 from taisoft.output.viewpoint import MAX_ELEVATION
 from taisoft.scene import checks
-from taisoft.scene.checks import nearest
 from taisoft.scene.look import Camera
 from taisoft.scene.tables import Table
 from taisoft.scene.toml import parsed
@@ -81,9 +80,8 @@ def names_of(option: str, text: str | None, known) -> tuple[str, ...] | None:
     """Return the comma-separated names in an option's value; `none` gives (), no value None. Raises SceneError."""
     if text is None:
         return None
-    names = tuple(name.strip() for name in text.split(",")) if text.strip() != "none" else ()
-    for name in names:
-        if name not in known:
-            hint = f"{nearest(name, known)}; there are {', '.join(known)}, and none"
-            raise SceneError(f"--{option} {text}: {name!r} is not a valid name{hint}")
-    return names
+    if text.strip() == "none":
+        return ()
+    return tuple(
+        checks.choice(name.strip(), f"--{option} {text}: a name other than none", tuple(known)) for name in text.split(",")
+    )

@@ -17,6 +17,7 @@ from pathlib import Path
 from types import ModuleType
 
 from taisoft.errors import MeshError, MissingPackage, SceneError, reworded
+from taisoft.scene import checks
 from taisoft.scene.checks import SOLVER_CHECKS, check_solver, nearest
 from taisoft.scene.refine import refined, with_order
 from taisoft.scene.scene import Scene
@@ -68,9 +69,7 @@ def bench(arguments: Namespace) -> int:
         print("usage: taisoft bench NAME [arguments of the benchmark]")
         _print_table(benchmarks)
         return 0
-    if arguments.name not in benchmarks:
-        hint = nearest(arguments.name, benchmarks)
-        raise SceneError(f"no benchmark is called {arguments.name!r}{hint}; there are {', '.join(benchmarks) or 'none'}")
+    checks.index(arguments.name, list(benchmarks), "no benchmark")
     return load_shipped("benchmarks", arguments.name).main(arguments.rest) or 0
 
 
@@ -173,8 +172,7 @@ def check_scene_solver(solver: dict) -> None:
 def refuse_unknown(names, keys: list[str], where: str) -> None:
     """Raise SceneError if one of the names is no key of a `solver` dict. where: start of the message."""
     for name in names:
-        if name not in keys:
-            raise SceneError(f"{where}no setting is called {name!r}{nearest(name, keys)}; there are {', '.join(keys)}")
+        checks.index(name, keys, f"{where}no setting")
 
 
 def load_module(path: Path) -> ModuleType:

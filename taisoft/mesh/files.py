@@ -34,7 +34,7 @@ from taisoft.mesh.tet_mesh import LARGEST_COORDINATE, TetMesh
 from taisoft.mesh.tetgen import read_tetgen
 from taisoft.mesh.topology import EDGES, distinct_edges, merged_points
 from taisoft.mesh.vtu import read_vtu
-from taisoft.scene.checks import number
+from taisoft.scene.checks import instance, number
 
 TETS = ("tetra", "tetra10")
 BOUNDARY = ("vertex", "line", "line3", "triangle", "triangle6")  # boundary markers that meshers add; ignored with a warning
@@ -80,8 +80,7 @@ def read_mesh(path, fix_orientation: bool = False, weld: float | None = None, re
 
 def from_meshio(mesh, *options) -> TetMesh:
     """Return the tets of a meshio.Mesh, as `TetMesh.from_meshio`. options: its other arguments. Raises MeshError."""
-    if not isinstance(mesh, meshio.Mesh):
-        raise MeshError(f"from_meshio needs a meshio.Mesh, not {type(mesh).__name__}")
+    instance(mesh, "from_meshio: mesh", meshio.Mesh, error=MeshError)
     return _clean_mesh("meshio.Mesh", content_of(mesh), *options)
 
 
@@ -95,9 +94,7 @@ def write_mesh(path, mesh: TetMesh, regions: bool = True) -> None:
     """
     file = Path(path)
     ending = check_ending(file)
-    if not isinstance(mesh, TetMesh):
-        raise MeshError(f"{file}: write_mesh needs a TetMesh, not {type(mesh).__name__}")
-    record = mesh.to_meshio()
+    record = instance(mesh, f"{file}: mesh", TetMesh, error=MeshError).to_meshio()
     if ending == ".mesh" and mesh.mid_edge is not None:
         warnings.warn(f"{file}: {ending} cannot hold mid-edge nodes; its edges are straight", UserWarning, stacklevel=2)
         record.points, record.cells[0] = mesh.vertices, meshio.CellBlock("tetra", mesh.tets)

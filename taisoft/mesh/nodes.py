@@ -16,6 +16,7 @@ from taisoft.attributes import MeshAttributeError, guarded_record
 from taisoft.errors import MeshError
 from taisoft.mesh.tet_mesh import TetMesh
 from taisoft.mesh.topology import EDGES, distinct_edges
+from taisoft.scene.checks import whole
 
 PARTS = 8  # linear tets of a second-order one; `Nodes.tets` lists those of each tet in sequence
 TIE_TOLERANCE = 1e-9  # relative difference below which squared diagonals count as equal
@@ -71,9 +72,7 @@ def make_nodes(mesh: TetMesh, order: int, middles: np.ndarray | None = None) -> 
     of the octahedron between them; surface triangle t = (a, b, c) of the mesh becomes rows 4t to 4t+3: (a, ab, ca),
     (ab, b, bc), (ca, bc, c), (ab, bc, ca). Raises MeshError for another order.
     """
-    if isinstance(order, bool) or order not in (1, 2):
-        raise MeshError(f"make_nodes: order must be 1 or 2, not {order!r}")
-    if order == 1:
+    if whole(order, "make_nodes: order", (1, 2), MeshError) == 1:
         return Nodes(mesh.vertices, mesh.tets, mesh.surface, mesh.tets[mesh.surface_tets], mesh.tets, mesh.surface)
     edges, edge_of_tet = distinct_edges(mesh.tets)
     a, b = mesh.vertices[edges[:, 0]], mesh.vertices[edges[:, 1]]

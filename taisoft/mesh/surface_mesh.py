@@ -22,7 +22,7 @@ from taisoft.mesh.stl import read_stl
 from taisoft.mesh.tet_mesh import TetMesh, checked_array, checked_points
 from taisoft.mesh.texture import checked_subsets, checked_uvs, subsets_of, transferred
 from taisoft.mesh.topology import Faces, connected_pieces, crack_widths, linked_groups, merged_points, triangle_edges
-from taisoft.scene.checks import number
+from taisoft.scene.checks import instance, number
 
 READERS = {".obj": read_obj, ".stl": read_stl, ".ply": read_ply, ".off": read_off}
 FORMATS = tuple(READERS)
@@ -221,9 +221,7 @@ def tetrahedralize(surface: SurfaceMesh, edge_length: float | None = None, envel
     faults, and of the volume with holes closed. The mesh's surface gets the uvs and subsets of the nearest triangles. Raises
     MeshError if the extra `mesh` is missing, nothing is enclosed, or the mesher fails.
     """
-    surface = as_surface(surface)
-    if not isinstance(surface, SurfaceMesh):
-        raise MeshError(f"tetrahedralize needs a SurfaceMesh (see read_surface), not {type(surface).__name__}")
+    surface = instance(as_surface(surface), "tetrahedralize: surface, as of read_surface,", SurfaceMesh, error=MeshError)
     name, diagonal = surface.source, float(np.linalg.norm(np.ptp(surface.vertices, axis=0)))
     lengths = {"above": 0.0, "below": diagonal, "unit": "m, the surface's diagonal", "error": MeshError}
     edge_length = diagonal / EDGES_PER_DIAGONAL if edge_length is None else number(edge_length, f"{name}: edge_length", **lengths)

@@ -32,6 +32,7 @@ from taisoft.output.nodal_fields import UNKNOWN_ERROR, NodalValues
 from taisoft.output.usd_curves import TENSION
 from taisoft.output.usd_scene import OF_CAMERA, scene_layer
 from taisoft.output.usd_surface import ERROR, IMPULSE, NORMALS, ROOT, STRESS, VELOCITIES
+from taisoft.scene import checks
 
 SCENE_NAME = "scene.usdc"
 CHUNKS_NAME = "chunks"
@@ -61,10 +62,8 @@ class UsdWriter(Observer):
         errors: bool = False,
         values: NodalValues | None = None,
     ):
-        if not fps > 0:
-            raise OutputError(f"USD export: fps is {fps}; it must be positive")
-        if chunk_frames < 1:
-            raise OutputError(f"USD export: chunk_frames is {chunk_frames}; it must be at least 1")
+        checks.number(fps, "USD export: fps", above=0.0, error=OutputError)
+        checks.whole(chunk_frames, "USD export: chunk_frames", error=OutputError)
         self.path = Path(folder) / SCENE_NAME
         self.chunks = make_folder(Path(folder) / CHUNKS_NAME)
         self.chunk_frames = chunk_frames

@@ -15,6 +15,7 @@ from taisoft.errors import SceneError, reason, value_text
 
 LARGEST, SMALLEST = float(np.finfo(np.float32).max), float(np.finfo(np.float32).tiny)  # limits of 32-bit floats
 UNIT_TOLERANCE = 8 * np.finfo(np.float64).eps  # squared lengths this close to 1 are kept, so vectors read back unchanged
+POSITIVE = range(1, 2**31)
 MAX_TOLERANCE = {"newton_tolerance": 0.1}  # a residual of a tenth of the forces is no solution; others: 1
 
 
@@ -140,19 +141,19 @@ def flag(value, what: str) -> bool:
     return value
 
 
-def whole(value, what: str, allowed: tuple[int, ...] | range) -> int:
+def whole(value, what: str, allowed: tuple[int, ...] | range = POSITIVE, error: type[Exception] = SceneError) -> int:
     """Return value as an int if it is one of the allowed integers."""
     if isinstance(value, (bool, np.bool_)) or not isinstance(value, (int, np.integer)) or int(value) not in allowed:
-        is_range = isinstance(allowed, range)
-        rule = f"a whole number from {allowed[0]} to {allowed[-1]}" if is_range else " or ".join(map(str, allowed))
-        raise SceneError(f"{what} must be {rule}, not {value_text(value)}")
+        limits = "of at least 1" if allowed is POSITIVE else f"from {allowed[0]} to {allowed[-1]}"
+        rule = f"a whole number {limits}" if isinstance(allowed, range) else " or ".join(map(str, allowed))
+        raise error(f"{what} must be {rule}, not {value_text(value)}")
     return int(value)
 
 
-def instance(value, what: str, kind: type, optional: bool = False):
+def instance(value, what: str, kind: type, optional: bool = False, error: type[Exception] = SceneError):
     """Return value if it is of a kind, or None where that is allowed."""
     if not isinstance(value, kind) and not (optional and value is None):
-        raise SceneError(f"{what} must be a {kind.__name__}{' or None' * optional}, not {type(value).__name__}")
+        raise error(f"{what} must be a {kind.__name__}{' or None' * optional}, not {type(value).__name__}")
     return value
 
 

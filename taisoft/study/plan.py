@@ -17,6 +17,7 @@ from taisoft.dynamics.schemes import EXPLICIT, INTEGRATORS
 from taisoft.errors import SceneError, TaisoftError, reworded
 from taisoft.estimation.first_choice import STABLE_FRACTION
 from taisoft.estimation.order import nominal_order
+from taisoft.scene import checks
 from taisoft.scene.scene import Scene
 from taisoft.settings import WITH_MULTIPLIERS, check_settings, kept_by_multipliers
 from taisoft.stability import stable_dt
@@ -166,8 +167,7 @@ class Planner:
         requested = self._request["reference_integrator"]
         given = kept_by_multipliers(scene)
         if requested is not None:
-            if requested not in INTEGRATORS:
-                raise SceneError(f"--reference-integrator {requested}: it must be one of {', '.join(INTEGRATORS)}")
+            checks.choice(requested, "--reference-integrator", INTEGRATORS)
             if given and requested not in WITH_MULTIPLIERS:
                 rule = f"{given[0]} needs {' or '.join(WITH_MULTIPLIERS)}"
                 raise SceneError(f"--reference-integrator {requested}: {rule}")

@@ -19,6 +19,7 @@ import numpy as np
 from taisoft.errors import OutputError
 from taisoft.mesh.placing import UP
 from taisoft.output.viewpoint import Viewpoint
+from taisoft.scene.checks import choice
 from taisoft.view.drawn import DrawnState
 
 UNITS = {"body": "", "stress": "Pa", "stretch": "", "speed": "m/s", "pressure": "Pa", "slip": "m", "error": "m"}
@@ -49,9 +50,7 @@ BACKGROUND = np.array([(0.95, 0.955, 0.96), (0.80, 0.81, 0.82)])  # sRGB, at the
 
 def checked_colour(kind: str) -> str:
     """Return the name of a colouring. Raises OutputError unless it is one of UNITS."""
-    if kind not in UNITS:
-        raise OutputError(f"colour {kind!r} is unknown: it must be one of {', '.join(UNITS)}")
-    return kind
+    return choice(kind, "colour", tuple(UNITS), OutputError)
 
 
 class Colouring:

@@ -18,7 +18,7 @@ import numpy as np
 
 from taisoft.errors import SceneError
 from taisoft.records import ERROR_KINDS, ErrorEstimate, StepReport
-from taisoft.scene.checks import nearest
+from taisoft.scene.checks import choice
 from taisoft.view.drawn import ENERGIES
 
 BLUE, ORANGE, GREEN, DARK = (0.16, 0.42, 0.74), (0.87, 0.42, 0.13), (0.20, 0.56, 0.28), (0.30, 0.30, 0.36)  # sRGB
@@ -181,9 +181,7 @@ class Plots(PlotChoice):
         self._sim, self._errors = sim, errors
         self.history, self.names = History(sim), names
         for name in names:
-            if name not in PLOTS:
-                raise SceneError(f"plot '{name}' is unknown{nearest(name, PLOTS)}; there are {', '.join(PLOTS)}")
-            if name not in self.available():
+            if choice(name, "plot", tuple(PLOTS)) not in self.available():
                 raise SceneError(f"plot '{name}' is not available: {self._why_unavailable(name)}")
 
     @property

@@ -168,8 +168,7 @@ class Layers:
 
     def __init__(self, scene, names: tuple[str, ...] = IN_WINDOW):
         for name in names:
-            if name not in LAYERS:
-                raise OutputError(f"layer '{name}' is unknown: it must be one of {', '.join(LAYERS)}")
+            checks.choice(name, "layer", LAYERS, OutputError)
         self.shown = {name: name in names for name in LAYERS}
         scene = DrawnScene.of(scene)
         self._shown = ShownBodies(scene)

@@ -42,7 +42,7 @@ BAD_SETTINGS = [
     (["--set", "solver.contact_solver=augmented_lagrangian"], "does not fit symplectic_euler: use 'auto' or "),
     (["--set", "young=3"], "the scene has no number 'young' (did you mean beam.young?)"),
     (["--set", "beam.young"], "write NAME.NUMBER=VALUE, such as beam.young=2e5, or solver.KEY=VALUE"),
-    (["--details", "pair"], "did you mean pairs?"),
+    (["--details", "pair"], "did you mean 'pairs'?"),
     (["--details", "pairs"], "--details pairs: contact forces are not modelled (one body"),
     (["--details", "quantities"], "--details quantities: the run has none"),
     (["--quantity", "reaction beam"], "--quantity reaction beam: write NAME=TEXT"),

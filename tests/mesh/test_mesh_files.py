@@ -61,7 +61,7 @@ def test_written_meshes_are_read_back_bitwise(tmp_path, ending):
 def test_a_failed_write_leaves_no_file(tmp_path, monkeypatch):
     with pytest.raises(MeshError, match="can be written as .msh, .vtk, .vtu, .mesh, not with the ending '.stl'"):
         write_mesh(tmp_path / "part.stl", MESH)
-    with pytest.raises(MeshError, match="needs a TetMesh, not tuple"):
+    with pytest.raises(MeshError, match="mesh must be a TetMesh, not tuple"):
         write_mesh(tmp_path / "part.msh", (MESH.vertices, MESH.tets))
     with pytest.raises(OutputError, match="cannot write .*absent/part.msh: No such file"):
         write_mesh(tmp_path / "absent" / "part.msh", MESH)
@@ -129,7 +129,7 @@ def test_other_elements_are_refused_by_name_and_number(tmp_path):
         for read, given in ((read_mesh, path), (TetMesh.from_meshio, meshio.Mesh(MESH.vertices, cells))):
             with pytest.raises(MeshError, match=refusal):
                 read(given)
-    with pytest.raises(MeshError, match="^from_meshio needs a meshio.Mesh, not str$"):
+    with pytest.raises(MeshError, match="^from_meshio: mesh must be a Mesh, not str$"):
         TetMesh.from_meshio("part.msh")
 
 

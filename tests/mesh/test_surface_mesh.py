@@ -181,7 +181,7 @@ def test_bad_arguments_and_absence_and_failure_of_the_mesher_are_reported(monkey
     for edge_length, rule in ((0.0, limits), (9.0, limits), (np.nan, "finite"), ("x", "a number"), (True, "a number")):
         with pytest.raises(MeshError, match=f"ball.obj: edge_length must be {rule}, not"):
             ts.tetrahedralize(surface, edge_length=edge_length)
-    with pytest.raises(MeshError, match="needs a SurfaceMesh"):
+    with pytest.raises(MeshError, match="surface, as of read_surface, must be a SurfaceMesh, not TetMesh"):
         ts.tetrahedralize(BALL)
     monkeypatch.setattr(surface_mesh, "find_spec", lambda name: None)
     with pytest.raises(MeshError, match=r"ball.obj: .* needs the package wildmeshing: pip install 'taisoft\[mesh\]'"):

@@ -166,7 +166,7 @@ def test_prim_names_are_valid_and_distinct(exported, tmp_path):
         (name, name) for name in NAMES
     ]
     for name in ("fps", "chunk_frames"):
-        with pytest.raises(OutputError, match=f"{name} is 0"):
+        with pytest.raises(OutputError, match=f"{name} must be"):
             UsdWriter(tmp_path, beam_scene(), **{name: 0})
 
 

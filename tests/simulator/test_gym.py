@@ -183,7 +183,7 @@ def test_actions_outside_of_the_space_are_refused_before_the_step(env, action, t
     [
         ({"reward": None}, ts.SceneError, "reward must be a function of the simulator, not None"),
         ({"action_space": 3}, ts.SceneError, "action_space must be a ts.gym.Box or another space of gymnasium, not 3"),
-        ({"frame_skip": 0}, ts.SimulationError, "frame_skip must be an integer of at least 1, not 0"),
+        ({"frame_skip": 0}, ts.SceneError, "frame_skip must be a whole number of at least 1, not 0"),
         ({"render_mode": "human"}, ts.SceneError, "render_mode must be one of rgb_array, not 'human'"),
         ({"view": [1.0, 2.0]}, ts.SceneError, r"view must have shape \(2, 3\), not \(2,\)"),
         ({"scene": dict}, ts.SceneError, "scene must be a Scene, not dict"),

@@ -78,9 +78,9 @@ def test_free_bodies_have_six_rigid_motions_each_and_bad_arguments_are_refused()
     assert np.abs(frequencies[:12]).max() < 1e-2 * frequencies[12]
     scene = one_body(constrained=True)
     for k, mass, message in (
-        (0, "lumped", "k = 0: it must be a whole number from 1 to the 23 free axes"),
-        (24, "lumped", "k = 24"),
-        (3, "none", "mass 'none' is unknown: it must be 'lumped' or 'consistent'"),
+        (0, "lumped", "k, of 23 free axes, must be a whole number from 1 to 23, not 0"),
+        (24, "lumped", "not 24"),
+        (3, "none", "mass must be one of lumped, consistent, not 'none'"),
     ):
         with pytest.raises(ts.SceneError, match=message):
             ts.modes(scene, k, mass=mass)

@@ -197,7 +197,7 @@ def test_finest_mesh_is_the_reference_in_space():
 def test_impossible_references_are_rejected():
     for changes, message in (
         ({"reference_dt": 1.0, "reference_integrator": "velocity_verlet"}, "reference-dt 1.*allows at most"),
-        ({"reference_integrator": "rk4"}, "reference-integrator rk4: it must be one of"),
+        ({"reference_integrator": "rk4"}, "reference-integrator must be one of"),
         ({"seconds": 0.01}, "coincide only every"),
     ):
         with pytest.raises(SceneError, match=message):

@@ -113,7 +113,7 @@ def test_layers_are_drawn_where_they_are_seen():
     dark = (fixed < 60).all(axis=2)
     assert dark.sum() > 50 and not (plain < 60).all(axis=2).any(), "fixed nodes are dark balls"
     assert np.array_equal(Offscreen(scene, LARGE).image(sim), fixed), "a default layer"
-    with pytest.raises(OutputError, match="layer 'wire' is unknown: it must be one of wires, contacts"):
+    with pytest.raises(OutputError, match="layer must be one of wires, contacts, .*, not 'wire'; did you mean 'wires'"):
         Offscreen(scene, SIZE, layers=("wire",))
 
 

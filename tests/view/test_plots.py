@@ -161,7 +161,7 @@ def test_only_simulated_quantities_are_available():
         assert [bool(available.pop(name, None)) for name in ("forces", "torques")] == [kind[1]] * 2 and available == expected
     for stub, name, message in (
         (Stub(True, False), "residuals", "not available: steps of velocity_verlet are explicit .* and contact forces"),
-        (Stub(), "energy", "plot 'energy' is unknown.*did you mean energies"),
+        (Stub(), "energy", "plot must be one of .*, not 'energy'; did you mean 'energies'"),
     ):
         with pytest.raises(SceneError, match=message):
             Plots(stub, (name,))

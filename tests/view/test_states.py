@@ -85,7 +85,7 @@ def test_refusals(stored, tmp_path):
             OutputError,
             "colour 'slip' cannot be drawn: frame 0 has kept speed, stress; .* --keep speed,stress,slip$",
         ),
-        (lambda: run.picture(0, SIZE, "slop"), OutputError, "colour 'slop' is unknown"),
+        (lambda: run.picture(0, SIZE, "slop"), OutputError, "colour must be one of .*; did you mean 'slip'"),
         (lambda: run.state(2), OutputError, "there is no frame 2: they are 0 to 5$"),
         (lambda: run.paint("tow", "#ffffff"), SceneError, "no body or obstacle is called 'tow' .did you mean two"),
         (lambda: run.paint("two", "red"), SceneError, "^'two': colour must be '#rrggbb'"),
