@@ -124,11 +124,11 @@ class Child:
         """Kill the process and what it has started."""
         _kill(self._process.pid)
 
-    def close(self) -> None:
-        """Close the link and wait for the end of the process; a second call does nothing."""
+    def close(self, seconds: float = END_SECONDS) -> None:
+        """Close the link, wait for the end of the process and then kill it; a second call does nothing."""
         self.link.close()
         try:
-            self._process.wait(END_SECONDS)
+            self._process.wait(seconds)
         except subprocess.TimeoutExpired:
             self.kill()
             self._process.wait()

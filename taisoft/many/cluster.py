@@ -33,6 +33,7 @@ class ClusterPlace:
             time.sleep(POLL_INTERVAL)
             if time.monotonic() - checked > ALIVE_CHECK_INTERVAL:
                 if why := self._lost():
+                    self._future = None  # nothing can be stopped there
                     return {"lost": why}
                 checked = time.monotonic()
         if future.status == "finished":

@@ -19,6 +19,7 @@ from taisoft.machine import THREADS
 from taisoft.processes import Child, LinkClosed
 
 POLL_INTERVAL = 0.01  # [s]
+STORE_SECONDS = 60.0  # in which a child must have stored its kernels, and end
 BLAS_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 BUDGET_SPENT, CUT_BY_BUDGET = "the budget was spent", "the budget was spent while it ran"
 
@@ -112,7 +113,7 @@ class LocalPlace:
         except LinkClosed:
             answer = {"crash": child.how_it_ended(" without an answer")}
         if self.threads is None or "crash" in answer or answer.get("last"):
-            child.close()  # it stores its kernels first
+            child.close(STORE_SECONDS)
             self._child = None
         return answer, is_new
 
@@ -128,12 +129,12 @@ class LocalPlace:
             raise SimulationError(f"no further process can be started: {error.strerror or error}") from error
 
     def stop(self) -> None:
-        """See Place. An idle process stores its kernels first."""
+        """See Place."""
         self._stopped, child = True, self._child
         if child is not None and self._is_busy:
             child.kill()  # its end is noticed by what waits for its answer
         elif child is not None:
-            child.close()
+            child.close(STORE_SECONDS)
             self._child = None
 
 
