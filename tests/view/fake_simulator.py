@@ -21,14 +21,18 @@ def beam_scene(names=("beam",), cells=(8, 2, 2), order=1):
     return scene
 
 
+def plan_of(touching: bool, why: str) -> Plan:
+    """A plan of contact forces alone."""
+    return Plan([{"feature": "contact_forces", "on": touching, "why": why}])
+
+
 class FakeSimulator:
     """Bends every body about its left end, more and more with time.
 
     Stress grows with time and along x, and each body's node 0 is pushed by the next one's, or by an obstacle.
     """
 
-    settings, plan, draggable, dragged, stable_dt = Settings(), Plan(), False, None, 1.0
-    plan.add("contact_forces", False, "", "one body")
+    settings, plan, draggable, dragged, stable_dt = Settings(), plan_of(False, "one body"), False, None, 1.0
 
     def __init__(self, scene, dt=1 / 60):
         self.scene, self.dt = scene, dt

@@ -13,7 +13,6 @@ from taisoft.output.viewpoint import camera_viewpoint, framed_points
 from taisoft.processes import Link, LinkClosed
 from taisoft.records import StepReport
 from taisoft.scene.checks import store
-from taisoft.scene.plan import Plan
 from taisoft.view import pictures
 from taisoft.view.drawn import DrawnScene
 from taisoft.view.link import SharedNodes
@@ -21,7 +20,7 @@ from taisoft.view.pictures import MIN_PICTURES, SLOTS, PictureOptions, PicturePr
 from taisoft.view.plots import Plots
 from taisoft.view.sampling import Sampler
 from tests.view.drawing import connected_scene, moving_scene, program, sampled, travelled
-from tests.view.fake_simulator import FakeSimulator, beam_scene
+from tests.view.fake_simulator import FakeSimulator, beam_scene, plan_of
 
 SIZE = (160, 90)
 
@@ -103,8 +102,7 @@ def test_a_scene_travels_whole():
 class Shown(FakeSimulator):
     """With all that pictures show."""
 
-    plan = Plan()
-    plan.add("contact_forces", True, "two bodies", "")
+    plan = plan_of(True, "two bodies")
 
     def tensions(self):
         return {one.name: k + self.time for k, one in enumerate((*self.scene.springs, *self.scene.tendons))}

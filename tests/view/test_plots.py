@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 
 from taisoft.errors import OutputError, SceneError
 from taisoft.records import Energies, ErrorEstimate, StepReport
-from taisoft.scene.plan import Plan
 from taisoft.view import annotations
 from taisoft.view.annotations import Annotations, curves_of
 from taisoft.view.colouring import COLOURS, Colouring
@@ -19,7 +18,7 @@ from taisoft.view.scene_view import Surfaces
 from tests.cli.command import BEAM, run, write
 from tests.output.png import decode
 from tests.view.drawing import body_mask, sampled
-from tests.view.fake_simulator import FakeSimulator, beam_scene
+from tests.view.fake_simulator import FakeSimulator, beam_scene, plan_of
 
 
 def started(capacity: int = 8, time: float = 0.0, kinetic: float = 0.0) -> History:
@@ -72,8 +71,7 @@ class Stub:
 
     def __init__(self, explicit=False, touching=True):
         self.settings = SimpleNamespace(explicit=explicit, integrator="velocity_verlet" if explicit else "bdf2")
-        self.plan = Plan()
-        self.plan.add("contact_forces", touching, "two bodies", "one body")
+        self.plan = plan_of(touching, "two bodies" if touching else "one body")
 
     def energies(self):
         return Energies(0.0, 0.0, 0.0)
