@@ -107,7 +107,7 @@ def test_invalid_arguments_are_rejected():
         (partly_fixed(""), {}, "body 'loose': nothing holds it along xyz, so it has no static state"),
         (partly_fixed("y"), {}, "body 'loose': nothing holds it along xz"),
         (ts.Scene(), {}, "solve_static needs a Scene that holds a body"),
-        (hanging(), {"tolerance": 0.0}, "tolerance = 0.0: it must lie between 0 and 0.1"),
+        (hanging(), {"tolerance": 0.0}, "tolerance must be greater than 0 and below 0.1, not 0.0"),
         (hanging(), {"time": np.nan}, "time must be finite"),
     ):
         with pytest.raises(ts.SceneError, match=message):

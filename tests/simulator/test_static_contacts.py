@@ -166,7 +166,7 @@ def test_what_nothing_can_hold_is_refused():
         (loose, {"steps": 2}, ts.SceneError, "body 'loose': nothing holds it along xyz"),
         (away, {}, ts.SimulationError, "nothing holds body 'block'"),
         (block_on_ground(), {"time": 0.0}, ts.SceneError, "time must be greater than 0 s"),
-        (block_on_ground(), {"steps": 0}, ts.SceneError, "steps must be a whole number from 1"),
+        (block_on_ground(), {"steps": 0}, ts.SceneError, "steps must be a whole number of at least 1"),
         (block_on_ground(), {"contact_tolerance": 2.0}, ts.SimulationError, "contact_tolerance"),
         (loose, {"error": True}, ts.SceneError, "error and quantities need steps, or a scene"),
     ):
