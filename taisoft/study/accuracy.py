@@ -19,6 +19,10 @@ from taisoft.study import mesh_name
 
 RICHARDSON = 3.0  # 2^2 - 1
 ROUNDING = 1e-9  # relative change of momentum that counts as rounding
+OF_RECORD = ("unconverged", "compile_seconds", "steps", "nodes", "tets", "threads")
+EXTREMES = {"penetration": "max_penetration", "contact_residual": "contact_residual", "inverted": "n_inverted"}
+# of a row; energy is a drift where it is kept, else relative to the reference, and penetration is over the smallest edge
+NUMBERS = ("energy", "energy_kept", "momentum", *EXTREMES, *OF_RECORD, "machine")
 
 
 @dataclass
@@ -41,31 +45,19 @@ class Reference:
 
 @dataclass
 class Row:
-    """Results of one setting of the study. Errors are None if unknown."""
+    """Results of one setting of the study. Errors and numbers, those of NUMBERS, are None if unknown."""
 
     setting: dict
     status: str  # ok | degraded | failed | refused | left out
     reason: str = ""
     seconds: list[float] = field(default_factory=list)  # wall time per simulated second [s], one number per repeat
-    compile_seconds: float | None = None
-    threads: int | None = None
     cores: list[int] = field(default_factory=list)
-    machine: str = ""
-    nodes: int | None = None
-    tets: int | None = None
-    steps: int | None = None
     in_time: Error | None = None
     in_time_sure: Error | None = None  # the reference's own error: smaller errors are not resolved
     in_space: Error | None = None
     in_space_sure: Error | None = None
     by_space: bool = False  # whether `error` is the error in space
-    energy: float | None = None
-    energy_kept: bool = False  # True: `energy` is a drift; False: an error relative to the reference
-    momentum: float | None = None
-    penetration: float | None = None  # over the smallest edge
-    contact_residual: float | None = None
-    unconverged: int | None = None
-    inverted: int | None = None
+    numbers: dict = field(default_factory=lambda: dict.fromkeys(NUMBERS) | {"energy_kept": False})
 
     @property
     def timing(self) -> Timing | None:
@@ -142,20 +134,20 @@ def error_in_space(path: np.ndarray, bodies: list, finest: Reference) -> Error:
 
 def row_of(record: dict, reference: Reference | None) -> Row:
     """Compare a finished run with the reference on its mesh; without a reference the errors stay None."""
-    row = Row(record["task"]["setting"], record["status"], "; ".join(record["problems"]), machine=record["machine"]["name"])
-    for name in ("seconds", "compile_seconds", "threads", "cores", "nodes", "tets", "steps", "unconverged"):
-        setattr(row, name, record.get(name))
+    row = Row(record["task"]["setting"], record["status"], "; ".join(record["problems"]), record["seconds"], record["cores"])
+    numbers = row.numbers
+    numbers |= {name: record.get(name) for name in OF_RECORD} | {"machine": record["machine"]["name"]}
     if extremes := record.get("extremes"):
-        row.inverted, row.contact_residual = (extremes[name].get("max") for name in ("n_inverted", "contact_residual"))
-        deepest = extremes["max_penetration"].get("max")
-        row.penetration = None if deepest is None else deepest / record["smallest_edge"]
+        numbers |= {name: extremes[key].get("max") for name, key in EXTREMES.items()}
+        if numbers["penetration"] is not None:
+            numbers["penetration"] /= record["smallest_edge"]
     if record["path"] is None or reference is None:
         return row
     row.in_time, row.in_time_sure = distance(record["path"], reference.path, reference.excursion), reference.own_error
-    energy, row.energy_kept = np.array(record["energies"], float).sum(axis=1), record["keeps_energy"]
-    expected = energy[0] if row.energy_kept else reference.energy
-    row.energy = _relative(np.abs(energy - expected).max(), reference.energy_scale)
-    row.momentum = momentum_error(record, np.array(record["momentum"], float), reference)
+    energy, numbers["energy_kept"] = np.array(record["energies"], float).sum(axis=1), record["keeps_energy"]
+    expected = energy[0] if record["keeps_energy"] else reference.energy
+    numbers["energy"] = _relative(np.abs(energy - expected).max(), reference.energy_scale)
+    numbers["momentum"] = momentum_error(record, np.array(record["momentum"], float), reference)
     return row
 
 

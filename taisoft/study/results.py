@@ -116,11 +116,14 @@ def _run_table(study: Study, rows: list[Row]) -> str:
     for name, what in (("in_time", " in time"), ("in_space", " in space")) if in_space else (("in_time", ""),):
         for heading, by in ((f"error{what}, max", "max"), (f"rms{what}", "rms")):
             columns.append((heading, lambda r, name=name, by=by: _error(getattr(r, name), getattr(r, f"{name}_sure"), by)))
-    shown = {"energy": "energy drift" if any(row.energy_kept for row in rows) else "energy error", "momentum": "momentum"}
+    shown = {
+        "energy": "energy drift" if any(row.numbers["energy_kept"] for row in rows) else "energy error",
+        "momentum": "momentum",
+    }
     if study.plan["touching"]:
         shown |= {"penetration": "penetration/edge", "contact_residual": "contact residual"}
     for name, heading in (shown | {"unconverged": "unconverged", "inverted": "inverted"}).items():
-        columns.append((heading, lambda r, name=name: _number(getattr(r, name))))
+        columns.append((heading, lambda r, name=name: _number(r.numbers[name])))
     return table(rows, [*columns, ("<status", lambda r: r.status)])
 
 
@@ -138,7 +141,7 @@ def _method(study: Study) -> str:
             f"{own.max:.2g} (max), {own.rms:.2g} (rms): {study.space_error_source}"
         )
     frame, frames = study.plan["frame"], study.plan["frames"]
-    threads = sorted({row.threads for row in study.rows if row.threads})
+    threads = sorted({n for row in study.rows if (n := row.numbers["threads"])})
     cores = f"{' or '.join(map(str, threads)) or 'no'} thread{'s' if threads != [1] else ''}, {study.workers} at a time"
     counts = sorted({len(row.seconds) for row in study.rows if row.seconds}) or [0]
     repeats = str(counts[0]) if len(counts) == 1 else f"{counts[0]} to {counts[-1]}"
@@ -187,38 +190,34 @@ def _number(value: float | int | None) -> str:
 
 def csv_of(study: Study) -> str:
     """Return all numbers as CSV (RFC 4180), one row per combination; unknown values are empty."""
-    front = study.front()
-    rows = [_cells(row, row in front) | {"error_by": study.request.by} for row in study.rows]
-    return csv_text([*rows[:1], *(["" if value is None else value for value in cells.values()] for cells in rows)])
+    rows = numbers_of(study)
+    return csv_text([*rows[:1], *(one.values() for one in rows)])
 
 
-def _cells(row: Row, on_front: bool) -> dict:
-    timing, record = row.timing, asdict(row)
-    cells = row.setting | {"status": row.status, "reason": row.reason, "on_front": on_front}
-    cells |= {"seconds_per_simulated_second": timing and timing.median, "spread": timing and spread_of(timing)}
-    cells |= {"repeats": len(row.seconds)}
-    for name in ("in_time", "in_space"):
-        error, own = record[name] or {}, record[f"{name}_sure"] or {}
-        for by in ("max", "rms"):
-            cells |= {f"error_{name}_{by}": error.get(by), f"reference_{name}_{by}": own.get(by)}
-    numbers = ("energy", "energy_kept", "momentum", "penetration", "contact_residual", "unconverged", "inverted")
-    return cells | {key: record[key] for key in (*numbers, "compile_seconds", "steps", "nodes", "tets", "threads", "machine")}
+def numbers_of(study: Study) -> list[dict]:
+    """Return the numbers of all rows by name, as study.csv and study.json hold them."""
+    front, by, found = study.front(), study.request.by, []
+    for row in study.rows:
+        timing, errors = row.timing, {}
+        for name in ("in_time", "in_space"):
+            for norm in ("max", "rms"):
+                errors[f"error_{name}_{norm}"] = getattr(getattr(row, name), norm, None)
+                errors[f"reference_{name}_{norm}"] = getattr(getattr(row, f"{name}_sure"), norm, None)
+        one = row.setting | {"status": row.status, "reason": row.reason, "on_front": row in front}
+        one |= {"seconds_per_simulated_second": timing and timing.median, "spread": timing and spread_of(timing)}
+        found.append(one | {"repeats": len(row.seconds)} | errors | row.numbers | {"error_by": by})
+    return found
 
 
 def plain_of(study: Study) -> dict:
     """Return a study as plain data for study.json."""
-    by, front, cheapest, nearest = study.request.by, study.front(), study.cheapest(), study.nearest()
+    cheapest, nearest = study.cheapest(), study.nearest()
     reference_keys = ("setting", "steps", "excursion", "own_error", "kind", "order_in_time", "problems")
-    rows = []
-    for row in study.rows:
-        pair = row.error(by)
-        derived = {"seconds_per_simulated_second": row.timing, "error": row.resolved_error(by), "on_front": row in front}
-        rows.append(asdict(row) | derived | {"below_reference": pair is not None and pair[0] < pair[1]})
     return {
         "request": asdict(study.request),
         "frame": study.plan["frame"],
         "frames": study.plan["frames"],
-        "rows": rows,
+        "rows": [one | {"seconds": row.seconds, "cores": row.cores} for one, row in zip(numbers_of(study), study.rows)],
         "references": [{k: getattr(r, k) for k in reference_keys} | {"in_space": r is study.space} for r in study.references],
         "cheapest": cheapest and cheapest.setting,
         "nearest": nearest and nearest.setting,

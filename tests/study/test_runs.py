@@ -52,7 +52,7 @@ def test_measured_order_of_convergence_is_the_integrators(tmp_path):
     errors = np.array([row.in_time.rms for row in rows])
     assert np.allclose(np.log2(errors[:-1] / errors[1:]), 1, atol=0.25), errors
     assert (errors > 10 * study.references[0].own_error.rms).all()  # errors are resolved
-    assert all(row.status == "ok" and row.unconverged == 0 and row.energy_kept for row in rows)
+    assert all(row.status == "ok" and row.numbers["unconverged"] == 0 and row.numbers["energy_kept"] for row in rows)
 
 
 def test_a_failed_run_is_recorded_with_the_reason(tmp_path):
