@@ -98,7 +98,7 @@ def read_row(data: dict) -> Row:
 
 def stored(request: list, compute: Callable[[], np.ndarray]) -> np.ndarray:
     """The array of a request, plain data, from the user's cache, or what `compute` returns, which is then kept there."""
-    key = digest([request, machine() | {"load": None}, code_digest(NOT_RUNNING), files_digest(SOURCES)])[:32]
+    key = digest([request, machine(), code_digest(NOT_RUNNING), files_digest(SOURCES)])[:32]
     store = Store()
     with suppress(StopIteration, OutputError):  # no folder can be used
         store = Store(next(cache_folders()) / "tolerance")
