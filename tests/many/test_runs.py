@@ -80,7 +80,7 @@ def test_other_results_fail(kind, message):
 
 
 def test_finished_rows_are_not_run_again(tmp_path, requests):
-    run = partial(ts.run_many, makes.add, out=tmp_path / "out", progress=False)
+    run = partial(ts.run_many, makes.add, workers=1, out=tmp_path / "out", progress=False)
     failing = {"a": 5, "how": "raise"}
     first = run([*ROWS, ROWS[0], failing])
     assert requests == [*ROWS, failing] and first[3] is first[0]
