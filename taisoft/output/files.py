@@ -69,9 +69,10 @@ class OutputFolder:
             with output_errors(f"cannot write to the output folder {path}"):
                 if first is None:
                     check_free(path, overwrite)
-                    self.clear(0, RESULT_FILES)
                 _clear_parts(self.path)
                 _probe(self.path)
+                if first is None:
+                    self.clear(0, RESULT_FILES)
         except BaseException:
             self.close()
             raise
@@ -80,8 +81,7 @@ class OutputFolder:
         """Remove files, and an earlier run's frames and chunks from number `first` on. Raises OutputError."""
         with output_errors(f"cannot write to the output folder {self.path}"):
             for name in files:
-                if not (self.path / name).is_dir():  # which `_probe` reports
-                    (self.path / name).unlink(missing_ok=True)
+                (self.path / name).unlink(missing_ok=True)
             _clear_frames(self.path, first)
 
     def close(self) -> None:
