@@ -1,41 +1,26 @@
 """Measurements of `collision.py`: searches for contacts by phase and by frame, broad phases, reductions.
 
-Phases are timed between synchronisations. The first search of a configuration compiles kernels and grows buffers and is timed
-separately.
+The first search of a configuration compiles kernels and grows buffers and is timed separately.
 """
 
 from dataclasses import asdict, dataclass, field
 from functools import partial
 
 import numpy as np
-import taichi as ti
 
 import taisoft as ts
-from taisoft.backend.arrays import FieldArena
-from taisoft.backend.runtime import Runtime, compile_clock, kernel
-from taisoft.collision.bvh import Bvh
-from taisoft.collision.candidates import Buffer, Pairs, entries, fill, list_pairs, pair_entries
-from taisoft.collision.detector import MERGED, Detection
-from taisoft.collision.path_check import NO_PASSAGES
-from taisoft.collision.reduction import FOUND, KEPT, LEFT, UNKNOWN, is_same
-from taisoft.collision.spatial_hash import SpatialHash
-from taisoft.fem.build import build_model
+from taisoft.backend.runtime import Runtime, compile_clock
 from taisoft.machine import Timing, summarise
-from taisoft.scene.plan import make_plan
 
-from .collision_cases import FPS, FRAMES, Setup, start
-from .runner import clock, repeated
+from .collision_cases import FRAMES, Setup
+from .collision_rig import HASH, PHASES, TREES, Quadratic, Rig, phases_of
+from .kinds import watching
+from .runner import REST, clock, repeated
 
-PHASES = ("boxes", "candidates", "contacts", "reduction")
 GEOMETRIES = ("proximity", "distance_field")
-HASH, TREES = "spatial_hash", ("bvh 6", "bvh 14", "bvh 18")
-DT = 1 / FPS
 ROUNDS, QUICK_ROUNDS = 15, 2
 FRAME_ROUNDS = 3
 TURNS = 3  # the rounds of compared broad phases are divided into this many turns
-
-
-NEAR = Pairs()  # a visitor of all near pairs
 
 
 @dataclass
@@ -108,157 +93,7 @@ class Sweep:
         return float(np.median(self.rounds[name]))
 
 
-# --- the quadratic reduction ---------------------------------------------------------------------------------------------
-
-
-@kernel
-def reduce_by_pairs(
-    r: ti.template(), out: ti.template(), order: ti.types.ndarray(), state: ti.template(), kept: ti.template(), tolerance: ti.f64
-):
-    """Two nested loops over the contacts of a search: a contact is kept unless an earlier kept one is the same."""
-    ti.loop_config(serialize=True)
-    for _ in range(1):
-        n = 0
-        for i in range(r.count[FOUND]):
-            at = order[i]
-            state[i] = KEPT
-            j = 0
-            while j < n and state[i] == KEPT:
-                if is_same(out, at, kept[j], tolerance):
-                    state[i] = UNKNOWN
-                j += 1
-            if state[i] == KEPT:
-                kept[n] = at
-                n += 1
-        state[r.count[FOUND]] = n
-
-
-class Quadratic:
-    """Reduction of a detection's last search by two nested loops."""
-
-    def __init__(self, detection: Detection):
-        self._detection, self._arena = detection, FieldArena()
-        self._capacity = n = detection.buffer.capacity
-        self._known: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
-        self._state, self._kept = (self._arena.field(name, ti.i32, n + 1) for name in ("state", "kept"))
-
-    def fits(self) -> bool:
-        """Whether the buffers have the detection's capacity."""
-        return self._capacity == self._detection.buffer.capacity
-
-    def reduce(self) -> None:
-        """Reduce the contacts."""
-        d = self._detection
-        reduce_by_pairs(d._reduction.work, d.buffer.data, self._order(), self._state, self._kept, MERGED * d.edge)
-
-    def _order(self) -> np.ndarray:
-        """Indices of the contacts ordered by kind and feature, then by index; computed once per search."""
-        d = self._detection
-        work = d._reduction.work
-        place = work.place.to_numpy()[: work.count[FOUND]]
-        feature = d.buffer.data.feature.to_numpy()[place]
-        known = self._known
-        if known is None or not (np.array_equal(known[0], place) and np.array_equal(known[1], feature)):
-            order = place[np.lexsort((place, feature[:, 2], feature[:, 1], feature[:, 0]))]
-            self._known = known = (place, feature, order.astype(np.int32))
-        return known[2]
-
-    def same(self) -> bool:
-        """Whether it kept the same contacts as the detection's reduction."""
-        r = self._detection._reduction.work
-        found, left = r.count[FOUND], r.count[LEFT]
-        if self._state.to_numpy()[found] != left:
-            return False
-        return np.array_equal(np.sort(self._kept.to_numpy()[:left]), np.sort(r.kept.to_numpy()[:left]))
-
-    def release(self) -> None:
-        """Free the memory."""
-        self._arena.release()
-
-
-# --- searches -----------------------------------------------------------------------------------------------------------
-
-
-class Rig:
-    """Model and detection of a configuration; a context manager."""
-
-    def __init__(self, setup: Setup, geometry: str, runtime: Runtime):
-        self.setup, self.runtime = setup, runtime
-        self.scene = setup.build(geometry)
-        self._arena, self._others, self._quadratic = FieldArena(), [], None
-        self.model, layout = build_model(
-            self.scene, runtime, self._arena, make_plan(self.scene, explicit=True, multistep=False).on
-        )
-        self.detection = Detection(self.scene, self.model, layout, runtime)
-        surface, makers = self.detection.surface, {"row": entries, "pairs": pair_entries}
-        self._lists = [Buffer(name, make, 2**12, None, surface.chunks, self._arena) for name, make in makers.items()]
-        self.tets = sum(body.mesh.n_tets for body in self.scene.bodies)
-
-    def __enter__(self) -> "Rig":
-        return self
-
-    def __exit__(self, *error) -> None:
-        for part in (*self._lists, *self._others):
-            part.release()
-        self.detection.release()
-        self._arena.release()
-
-    def place(self, fraction: float) -> None:
-        """Move the nodes to their positions at a fraction of the film."""
-        x = start(self.scene) if self.setup.motion is None else self.setup.motion(self.scene, fraction)
-        self.model.state.x.from_numpy(x)
-
-    def search(self) -> None:
-        """Run a whole search."""
-        self.detection.find(0.0, DT)
-
-    def phases(self) -> dict[str, float]:
-        """Run the phases of a search; returns the wall seconds of each."""
-        d, times = self.detection, [clock()]
-        d._move(0.0, DT)
-        times.append(clock())
-        near = d._near()
-        times.append(clock())
-        fill(lambda: d._fill_buffer(near, NO_PASSAGES), *d._scratch(), d.buffer)
-        times.append(clock())
-        d._reduction.reduce(-np.inf)
-        times.append(clock())
-        return dict(zip(PHASES, np.diff(times).tolist()))
-
-    def list_pairs(self, broad=None) -> None:
-        """Run a broad phase, by default the detection's, and list the pairs of triangles that are near each other."""
-        d = self.detection
-        near, (row, out) = (broad or d.broad).near(), self._lists
-        fill(lambda: list_pairs(d.surface, near, row.parts, NEAR, out.parts), row, out)
-
-    def pairs(self, broad=None) -> np.ndarray:
-        """These pairs (k,2)."""
-        self.list_pairs(broad)
-        out = self._lists[1]
-        return out.data.to_numpy()[out.filled(out.used.to_numpy()), :2]
-
-    def n_pairs(self, broad=None) -> int:
-        """Number of these pairs."""
-        return len(self.pairs(broad))
-
-    def broad_phase(self, name: str, ratio: float | None = None) -> SpatialHash | Bvh:
-        """A broad phase of this surface: HASH with a ratio of cell to mean edge, or one of TREES."""
-        d, arena = self.detection, FieldArena()
-        x = start(self.scene)[d.topology.node]
-        if name == HASH:
-            ratio = self.scene.collision.cell_ratio if ratio is None else ratio
-            made = SpatialHash(d.surface, arena, ratio * d.edge, np.ptp(x, axis=0))
-        else:
-            made = Bvh(d.surface, d.topology, x, d.reach, self.runtime, arena, int(name.split()[1]))
-        self._others += [made, arena]
-        return made
-
-    def quadratic(self) -> Quadratic:
-        """The quadratic reduction of the last search, rebuilt if the contact buffer has grown."""
-        if self._quadratic is None or not self._quadratic.fits():
-            self._quadratic = Quadratic(self.detection)
-            self._others.append(self._quadratic)
-        return self._quadratic
+# --- measured ------------------------------------------------------------------------------------------------------------
 
 
 def measure_row(setup: Setup, geometry: str, runtime: Runtime, rounds: int) -> Row:
@@ -275,11 +110,11 @@ def measure_row(setup: Setup, geometry: str, runtime: Runtime, rounds: int) -> R
             row.active, row.found, row.contacts, row.pairs = counts.active, counts.found, counts.contacts, rig.n_pairs()
             row.field_bytes = sum(rig.detection._arena.bytes.values())
             row.whole = repeated(rig.search, rounds)
-            taken = [rig.phases() for _ in range(len(row.whole))]
-            row.phases = {name: [t[name] for t in taken] for name in PHASES}
-            quadratic = rig.quadratic()
-            quadratic.reduce()
-            row.same, row.quadratic = quadratic.same(), repeated(quadratic.reduce, rounds)
+            with watching() as spend:
+                taken = [phases_of(spend(rig.search)) for _ in row.whole]
+            row.phases = {name: [one[name] for one in taken] for name in (*PHASES, REST)}
+            with Quadratic(rig.detection) as quadratic:
+                row.same, row.quadratic = quadratic.same(), repeated(quadratic.reduce, rounds)
     except ts.TaisoftError as error:
         row.failure = str(error)
     return row
@@ -294,12 +129,12 @@ def measure_film(setup: Setup, geometry: str, runtime: Runtime, frames: int = FR
         for k in range(-1, frames):  # the last frame first, to compile and to grow buffers
             rig.place(1.0 if k < 0 else k / max(frames - 1, 1))
             rig.search()
-            quadratic = rig.quadratic()
-            quadratic.reduce()
-            film.same &= quadratic.same()
-            rounds = [rig.phases() for _ in range(FRAME_ROUNDS)]
-            numbers = {name: float(np.median([r[name] for r in rounds])) for name in PHASES}
-            numbers["quadratic"] = float(np.median(repeated(quadratic.reduce, FRAME_ROUNDS)))
+            with watching() as spend:
+                taken = [phases_of(spend(rig.search)) for _ in range(FRAME_ROUNDS)]
+            numbers = {name: float(np.median([one[name] for one in taken])) for name in PHASES}
+            with Quadratic(rig.detection) as quadratic:
+                film.same &= quadratic.same()
+                numbers["quadratic"] = float(np.median(repeated(quadratic.reduce, FRAME_ROUNDS)))
             for name, other in others.items():
                 rig.n_pairs(other)
                 numbers[name] = float(np.median(repeated(partial(rig.list_pairs, other), FRAME_ROUNDS)))

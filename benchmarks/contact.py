@@ -1,17 +1,19 @@
-"""Contact: solvers on the problems of whole scenes, colourings, cost of steps, problems of rigid scenes.
+"""Contact: solvers on the problems of whole scenes, colourings, cost of steps, real meshes, problems of rigid scenes.
 
 taisoft bench contact [--quick] [--arch cpu|cuda] [--out FILE.json]
 
-Scenes are demos, in f32; figure numbers are those of the report, which `taisoft bench report` draws. In each frame of an explicit
-run every solver solves the contact problem in turn to a residual of 1e-4, from the impulses of the previous step and from zero.
-Residuals are computed in NumPy. A solve's time includes its colouring and excludes compilation; loops run on one CPU thread, or
-on all if stated. Numbers are medians with their range in brackets; spread is the interquartile range over the median. Exit
-status: 0, or 1 if a limit is not met. --quick has one scene, few frames, and no limits. A full run takes about six minutes on two
-cores.
+Scenes are demos, in f32, and real meshes that fall to the ground: assets/bunny.msh, and those of ../shared/meshes where it is.
+Figure numbers are those of the report, of which `taisoft bench report` judges claims by these numbers. In each frame of an
+explicit run every solver solves the contact problem in turn to a residual of 1e-4, from the impulses of the previous step and
+from zero. Residuals are computed in NumPy. A solve's time includes its colouring and excludes compilation; loops run on one CPU
+thread, or on all if stated. What steps spend is explained in benchmarks/kinds.py. Numbers are medians with their range in
+brackets; spread is the interquartile range over the median. Exit status: 0, or 1 if a limit is not met. --quick has few scenes
+and frames, and no limits. A full run takes about eight minutes on two cores.
 """
 
 import sys
 from contextlib import closing
+from itertools import product
 
 import numpy as np
 
@@ -31,29 +33,23 @@ from .contact_colouring import (
     crossover_text,
     measure_crossover,
 )
-from .contact_runs import (
-    COLD,
-    GOAL,
-    PARTS,
-    WARM,
-    Film,
-    Run,
-    Solvers,
-    StepCost,
-    measure_film,
-    measure_run,
-    measure_step,
-    open_explicit,
-    open_scene,
-    to_impulses,
-)
+from .contact_colouring import SCENE as COLOURED
+from .contact_runs import COLD, EXPLICIT, GOAL, WARM, Film, Solvers, measure_film, open_demo, to_impulses
+from .contact_steps import Profile, Run, measure_run, measure_steps, open_drop, real_meshes
 from .document import Document, Limit, begin, ms, ranged, table, timed_cells, timed_limit
-from .runner import REST, make_parser, parse_options
+from .kinds import KINDS
+from .runner import make_parser, parse_options
 
 DEMOS = ("cube_on_box", "two_cubes_two_boxes")  # figures 20 and 19
 FRAMES, QUICK_FRAMES = 90, 6
 STEPS, QUICK_STEPS = 400, 40
+SETTLE = 60  # steps after the first impulse until cubes rest on their boxes
 RUN_SECONDS, QUICK_RUN_SECONDS = 2.0, 0.4
+SHEET = "sheet_and_cube"  # demonstration 3 of the report
+STABLE = 0.9  # of the sheet's largest stable step
+SHEET_STEPS = {"symplectic_euler": (400, 60), "implicit_euler": (120, 20)}  # of a full and a quick run
+GEOMETRIES = ("distance_field", "proximity")  # the first, in explicit steps, is the report's
+DROP_SECONDS, QUICK_DROP_SECONDS = 1.0, 0.2
 QUICK_PROBLEMS, REPEATS = ("Rover1039", "Rover4396"), 3
 CONTACTS = {"cube_on_box": 198, "two_cubes_two_boxes": 286}  # in the report's figures 20 and 19
 STEP_SCENE, STEP_LIMIT = "cube_on_box", 2.0  # [ms] an explicit step, f32, to a residual of GOAL
@@ -63,30 +59,52 @@ SWEEP_LIMIT = 0  # problems of the films that the default CPU solver leaves abov
 
 def measure(quick: bool, arch: str, document: Document) -> dict:
     """Measure and print everything; results by name."""
-    found: dict = {"films": [], "steps": [], "runs": [], "colourings": []}
+    found: dict = {"films": [], "steps": [], "runs": [], "drops": [], "colourings": []}
     demos = DEMOS[: 1 if quick else None]
-    for name in demos:  # film, step and colourings with one simulator
-        with open_explicit(name, arch) as sim:
-            found["films"].append(measure_film(name, sim, QUICK_FRAMES if quick else FRAMES, Solvers(threads=not quick)))
-            to_impulses(sim)
-            found["colourings"] += colour_all(name, sim._dynamics.contact.problem, QUICK_SEEDS if quick else SEEDS)[0]
-            found["steps"].append(measure_step(name, sim, QUICK_STEPS if quick else STEPS))
-    document.add(f"## Explicit steps (figs. 19, 20)\n\n{count_table(found['films'])}\n\n{solver_table(found['films'])}")
-    document.add(f"## The whole explicit step\n\n{step_table(found['steps'])}")
     for name in demos:
-        with open_scene(name, arch) as sim:
+        with open_demo(name, arch, **EXPLICIT) as sim:
+            found["films"].append(measure_film(name, sim, QUICK_FRAMES if quick else FRAMES, Solvers(threads=not quick)))
+            found["steps"].append(measure_steps(name, sim, QUICK_STEPS if quick else STEPS))
+    found["steps"] += _sheet_steps(quick, arch)
+    document.add(f"## Explicit steps (figs. 19, 20)\n\n{count_table(found['films'])}\n\n{solver_table(found['films'])}")
+    document.add(f"## Whole steps (fig. 10)\n\n{step_table(found['steps'])}\n\n{kind_table(found['steps'])}")
+    for name in (*demos, *(() if quick else (PILE,))):
+        with open_demo(name, arch) as sim:
             found["runs"].append(measure_run(name, sim, QUICK_RUN_SECONDS if quick else RUN_SECONDS))
-    if not quick:
-        with open_scene(PILE, arch) as sim:
-            found["runs"].append(measure_run(PILE, sim, PILE_SECONDS))
-            found["colourings"] += colour_all(PILE, sim._dynamics.contact.problem, SEEDS)[0]
+            if name == PILE:
+                found["colourings"] += colour_all(name, sim._dynamics.contact.problem, SEEDS)[0]
     document.add(f"## Implicit steps\n\n{run_table(found['runs'])}")
+    for name, path in list(real_meshes().items())[: 1 if quick else None]:
+        with open_drop(path, arch) as sim:
+            found["drops"].append(measure_run(name, sim, QUICK_DROP_SECONDS if quick else DROP_SECONDS))
+    document.add(f"## Real meshes that fall to the ground\n\n{run_table(found['drops'])}")
+    for refine in (0,) if quick else (0, 1):
+        with open_demo(COLOURED, arch, refine or None, **EXPLICIT) as sim:
+            to_impulses(sim)
+            for _ in range(SETTLE):
+                sim.step()
+            name = f"{COLOURED}, refined" if refine else COLOURED
+            colourings, touching = colour_all(name, sim._dynamics.contact.problem, QUICK_SEEDS if quick else SEEDS)
+            found["colourings"] += colourings
+            found.setdefault("touching", touching)
     document.add(f"## Colours (fig. 19)\n\n{colour_table(found['colourings'])}")
     with closing(open_runtime(arch, "f32", "the benchmark of contacts")) as runtime:
         found["crossover"] = measure_crossover(QUICK_SIZES if quick else SIZES, runtime)
     table, text = crossover_table(found["crossover"]), crossover_text(found["crossover"], arch)
     document.add(f"## Serial and coloured Gauss-Seidel\n\n{table}\n\n{text}")
     found["problems"] = _problems(quick, document)
+    return found
+
+
+def _sheet_steps(quick: bool, arch: str) -> list[Profile]:
+    """Steps of the sheet, explicit ones near their limit and the demo's own, with each geometry."""
+    found = []
+    for integrator, geometry in list(product(SHEET_STEPS, GEOMETRIES))[: 1 if quick else None]:
+        settings = {"dt": 1e-6, "integrator": integrator} if integrator == EXPLICIT["integrator"] else {}
+        with open_demo(SHEET, arch, geometry=geometry, **settings) as sim:
+            if settings:
+                sim.dt = STABLE * sim.stable_dt
+            found.append(measure_steps(SHEET, sim, SHEET_STEPS[integrator][quick]))
     return found
 
 
@@ -149,7 +167,8 @@ def solver_table(films: list[Film]) -> str:
 
 def run_table(runs: list[Run]) -> str:
     """A row per implicit run: medians over steps with contacts; problems below."""
-    columns = [("<scene", "{.scene}"), ("<steps", "{.settings}"), ("with contacts", lambda r: str(len(r.seconds)))]
+    columns = [("<scene", "{.scene}"), ("tets", "{.tets:,}"), ("<steps", "{.settings}")]
+    columns.append(("with contacts", lambda r: str(len(r.seconds))))
     counts = (("contacts", "contacts"), ("multipliers", "outer"), ("Newton", "newton"), ("CG", "linear"))
     columns += [(heading, lambda r, name=name: ranged(getattr(r, name))) for heading, name in counts]
     columns += [
@@ -161,21 +180,28 @@ def run_table(runs: list[Run]) -> str:
     return table(runs, columns, [f"{r.scene}: {text}" for r in runs for text in r.problems])
 
 
-def step_table(costs: list[StepCost]) -> str:
-    """Medians of whole explicit steps and their parts."""
-    columns = [
-        ("<scene", "{.scene}"),
-        ("<solver", "{.solver}"),
-        ("steps", lambda c: str(len(c.whole))),
-        ("contacts", lambda c: ranged(c.contacts)),
-        ("sweeps", lambda c: ranged(c.sweeps)),
+STEPS_OF = (("<scene", "{.scene}"), ("<steps", "{.integrator}"), ("<geometry", "{.geometry}"))
+
+
+def step_table(profiles: list[Profile]) -> str:
+    """Medians of whole steps."""
+    columns = (
+        *STEPS_OF,
+        ("dt [ms]", lambda p: ms(p.dt)),
+        ("steps", lambda p: str(len(p.whole))),
+        ("contacts", lambda p: ranged(p.contacts)),
+        ("sweeps", lambda p: ranged(p.sweeps)),
         ("worst residual", "{.residual:.1e}"),
-        ("step [ms]", lambda c: timed_cells(c.whole)[0]),
-        ("spread", lambda c: timed_cells(c.whole)[1]),
-    ]
-    return table(
-        costs, columns + [(f"{part} [ms]", lambda c, part=part: ms(np.median(c.parts[part]))) for part in (*PARTS, REST)]
+        ("step [ms]", lambda p: timed_cells(p.whole)[0]),
+        ("spread", lambda p: timed_cells(p.whole)[1]),
     )
+    return table(profiles, columns)
+
+
+def kind_table(profiles: list[Profile]) -> str:
+    """What mean steps spend by kind."""
+    kinds = [kind for kind in KINDS if any(kind in p.kinds for p in profiles)]
+    return table(profiles, (*STEPS_OF, *((f"{kind} [ms]", lambda p, kind=kind: ms(p.kinds.get(kind, 0.0))) for kind in kinds)))
 
 
 def find_limits(found: dict) -> list[Limit]:

@@ -17,12 +17,13 @@ from taisoft.contact.colouring import UNCOLOURED, colour_contacts, colour_greedy
 from taisoft.contact.problem import ContactProblem, build_node_problem, fill_rows, find_factors, index_nodes, read_entries
 
 from .contact_runs import COLOURED, SERIAL, THREADED, Outcome, Solvers
-from .document import crossovers, ms, table
+from .document import crossovers, ms, ranged, table
 from .runner import clock
 
 SEEDS, QUICK_SEEDS = 15, 3  # of random colourings
 ROUNDS = 3  # of solvers and deterministic colourings
-REPORT = {"two_cubes_two_boxes": (286, {"greedy": 95, "random": 125})}  # contacts, colours
+SCENE = "two_cubes_two_boxes"  # that of the report
+REPORT = {SCENE: (286, {"greedy": 95, "random": 125})}  # contacts, colours
 SIZES, QUICK_SIZES = (4, 8, 16, 32, 64, 128, 192), (8, 16)  # cells along a plate
 TURN, FRICTION, SEED = np.radians(10.0), 0.5, 1
 FALL, SHAKE = -0.04, 0.02  # [m/s]
@@ -43,6 +44,15 @@ class Colouring:
     numbers: list[int]
     largest: list[int]
     seconds: list[float]
+
+
+@dataclass(frozen=True)
+class Touching:
+    """Which contacts touch which nodes, a pair each, the nodes numbered without gaps; colours of the contacts by method."""
+
+    contacts: list[int]
+    nodes: list[int]
+    colours: dict[str, list[int]]
 
 
 def node_graph(contact: np.ndarray, node: np.ndarray, k: int, inverse_mass: np.ndarray) -> sp.csr_matrix:
@@ -108,8 +118,8 @@ def _parallel(p: ContactProblem) -> np.ndarray:
     return p.sweep.colour.to_numpy()[: int(p.count[0])]
 
 
-def colour_all(scene: str, p: ContactProblem, seeds: int) -> tuple[list[Colouring], dict[str, np.ndarray]]:
-    """Colourings of the contacts of `p`, and the colours (k,) by method."""
+def colour_all(scene: str, p: ContactProblem, seeds: int) -> tuple[list[Colouring], Touching]:
+    """Colourings of the contacts of `p`, and an example of each method."""
     graph, k, colourings, colours = graph_of(p), int(p.count[0]), [], {}
     start, movable = p.by_node.start.to_numpy(p.n_nodes + 1), (p.inverse_mass.to_numpy() != 0.0).any(axis=1)
     least = int(np.diff(start)[movable].max())
@@ -130,27 +140,30 @@ def colour_all(scene: str, p: ContactProblem, seeds: int) -> tuple[list[Colourin
             sizes = np.bincount(colour)
             numbers.append(len(sizes))
             largest.append(int(sizes.max()))
-            colours.setdefault(name, colour)
+            colours.setdefault(name, colour.tolist())
         colourings.append(Colouring(scene, name, k, least, numbers, largest, seconds))
-    return colourings, colours
+    contact, node, _ = read_entries(p)
+    pairs = np.unique(np.column_stack([contact, np.unique(node, return_inverse=True)[1]]), axis=0)
+    return colourings, Touching(*pairs.T.tolist(), colours)
 
 
 def colour_table(colourings: list[Colouring]) -> str:
     """A row per scene and method, then those of the report."""
-
-    def counts(values: list[int]) -> str:
-        low, high = min(values), max(values)
-        return f"{np.median(values):g}" + ("" if low == high else f" ({low} to {high})")
-
-    lines = []
-    for c in colourings:
-        each = f"{c.contacts / np.median(c.numbers):.1f}"
-        lines.append((c.scene, c.way, c.contacts, c.least, counts(c.numbers), each, counts(c.largest), ms(np.median(c.seconds))))
+    rows = [(c.scene, c.way, c.contacts, c.least, c.numbers, c.largest, ms(np.median(c.seconds))) for c in colourings]
     for scene in dict.fromkeys(c.scene for c in colourings):
         contacts, found = REPORT.get(scene, (0, {}))
-        lines += [(f"{scene}, the report", name, contacts, "-", n, f"{contacts / n:.1f}", "-", "-") for name, n in found.items()]
-    headings = ("<scene", "<colouring", "contacts", "at one node", "colours", "contacts per colour", "largest", "ms")
-    return table(lines, [(heading, f"{{[{k}]}}") for k, heading in enumerate(headings)])
+        rows += [(f"{scene}, the report", name, contacts, "-", [n], [], "-") for name, n in found.items()]
+    columns = (
+        ("<scene", "{[0]}"),
+        ("<colouring", "{[1]}"),
+        ("contacts", "{[2]}"),
+        ("at one node", "{[3]}"),
+        ("colours", lambda row: ranged(row[4])),
+        ("contacts per colour", lambda row: f"{row[2] / np.median(row[4]):.1f}"),
+        ("largest", lambda row: ranged(row[5])),
+        ("ms", "{[6]}"),
+    )
+    return table(rows, columns)
 
 
 # --- serial and coloured ------------------------------------------------------------------------------------------------

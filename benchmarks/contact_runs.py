@@ -1,4 +1,4 @@
-"""Measurements of `contact.py`: contact problems of explicit steps with every solver, costs of steps, implicit runs.
+"""Measurements of `contact.py`: contact problems of explicit steps with every solver.
 
 A film starts at the first impulse. In each frame, every solver solves the contact problem of the last step, from the impulses of
 the previous step and from zero; the run itself continues with the default solver. NumPy computes the residual of each solution,
@@ -20,26 +20,19 @@ from taisoft.contact.colouring import colour_contacts
 from taisoft.contact.matrix_contacts import jacobian
 from taisoft.contact.problem import ContactProblem
 from taisoft.contact.solve import solve
-from taisoft.dynamics import contact_measures, explicit_contact_stepper
+from taisoft.dynamics import explicit_contact_stepper
 from taisoft.dynamics.explicit_contact_stepper import MAX_SWEEPS
 
-from .runner import REST, Stopwatch, clock, patched, timed
+from .runner import clock, patched
 
 GOAL = 1e-4  # residual, that of explicit steps in f32
 SERIAL, COLOURED = "gauss_seidel", "coloured_gauss_seidel"
 THREADED = ", all threads"  # suffix of solvers whose loops run on all threads
-DT, FPS = 1 / 240, 60.0  # explicit steps and films [s, 1/s]
+EXPLICIT, FPS = {"dt": 1 / 240, "integrator": "symplectic_euler"}, 60.0  # steps and frames of films [s, 1/s]
 LATEST = 2.0  # [s] time limit for the first impulse
 WARM, COLD = "from the step before", "from none"
 ROUNDS, COLD_ROUNDS = 3, 1
 SETTINGS = ("integrator", "contact_solver", "contact_tolerance", "newton_tolerance", "linear_tolerance", "dt")
-# parts of an explicit step and the functions called in them
-PARTS = {
-    "search": ("find", "measure_closing"),
-    "problem": ("begin", "set_free_velocities", "find_factors"),
-    "solve": ("colour_contacts", "solve"),
-    "elasticity": ("predict", "move"),
-}
 
 
 # --- problems -----------------------------------------------------------------------------------------------------------
@@ -163,48 +156,18 @@ class Film:
         return sum(not o.residual <= 1.001 * GOAL for name in solvers for start in self.outcomes for o in self.of(name, start))
 
 
-@dataclass
-class StepCost:
-    """Explicit steps from the first impulse on. whole: wall seconds of each `step` with its report; parts: of the same steps when
-    repeated."""
-
-    scene: str
-    solver: str
-    whole: list[float]
-    parts: dict[str, list[float]]
-    contacts: list[int]
-    sweeps: list[int]
-    residual: float
-    problems: list[str]
-
-
-@dataclass
-class Run:
-    """An implicit run: lists over its steps with contacts; wall: seconds of all steps without compilation."""
-
-    scene: str
-    settings: str
-    status: str
-    problems: list[str]
-    simulated: float
-    wall: float
-    seconds: list[float] = field(default_factory=list)
-    contacts: list[int] = field(default_factory=list)
-    outer: list[int] = field(default_factory=list)
-    newton: list[int] = field(default_factory=list)
-    linear: list[int] = field(default_factory=list)
-
-
-def open_scene(name: str, arch: str, refine: int | None = None, **settings) -> ts.Simulator:
+def open_demo(name: str, arch: str, refine: int | None = None, geometry: str | None = None, **settings) -> ts.Simulator:
     """A simulator of a demo's scene in f32; without settings, with the demo's own. refine: number of refinements."""
     scene, own = load_scene(name, refine=refine)
+    for body in scene.bodies:
+        body.collision = geometry or body.collision
     settings = settings or {key: own[key] for key in SETTINGS if key in own}
     return ts.Simulator(scene, precision="f32", arch=arch, **settings)
 
 
-def open_explicit(name: str, arch: str, refine: int | None = None) -> ts.Simulator:
-    """A simulator of a demo's scene with explicit steps."""
-    return open_scene(name, arch, refine, dt=DT, integrator="symplectic_euler")
+def n_tets(sim: ts.Simulator) -> int:
+    """Number of tets."""
+    return sum(body.mesh.n_tets for body in sim.scene.bodies)
 
 
 def to_impulses(sim: ts.Simulator) -> None:
@@ -218,8 +181,7 @@ def to_impulses(sim: ts.Simulator) -> None:
 
 def measure_film(name: str, sim: ts.Simulator, frames: int, solvers: Solvers) -> Film:
     """A film of `frames` frames, without those whose contacts need no impulse."""
-    tets = sum(body.mesh.n_tets for body in sim.scene.bodies)
-    film = Film(name, tets, sim.dt, sim.stable_dt)
+    film = Film(name, n_tets(sim), sim.dt, sim.stable_dt)
     known: list[ContactProblem] = []
 
     def observe(p: ContactProblem) -> None:
@@ -244,58 +206,3 @@ def measure_film(name: str, sim: ts.Simulator, frames: int, solvers: Solvers) ->
         with observe_problems(observe):
             sim.step()
     return film
-
-
-def explicit_places(sim: ts.Simulator) -> list[tuple[str, object, str]]:
-    """The functions of each part of explicit steps, for `Stopwatch.on`."""
-    contact = sim._dynamics.contact
-    owners = {"find": contact.detection, "measure_closing": contact_measures, "begin": contact}
-    return [(part, owners.get(name, explicit_contact_stepper), name) for part, names in PARTS.items() for name in names]
-
-
-def measure_step(name: str, sim: ts.Simulator, steps: int) -> StepCost:
-    """Cost of steps from the first impulse on, and of their parts when the same steps are repeated."""
-    sim.reset()
-    to_impulses(sim)
-    cost = StepCost(name, sim._dynamics.stepper.method, [], {part: [] for part in (*PARTS, REST)}, [], [], 0.0, [])
-    for _ in range(steps):
-        begin = clock()
-        report = sim.step()
-        cost.whole.append(clock() - begin)
-        cost.contacts.append(report.n_contacts)
-        cost.sweeps.append(report.contact_iterations)
-        cost.residual = max(cost.residual, report.contact_residual)
-        cost.problems += report.problems
-    sim.reset()
-    to_impulses(sim)
-    watch = Stopwatch()
-    with watch.on(explicit_places(sim)):
-        for _ in range(steps):
-            spent = watch.parts_of(sim.step)
-            for part, seconds in cost.parts.items():
-                seconds.append(spent.get(part, 0.0))
-    return cost
-
-
-def measure_run(name: str, sim: ts.Simulator, seconds: float) -> Run:
-    """Run the demo's own implicit steps for some seconds."""
-    spent: list[float] = []
-    plain = sim.advance
-
-    def advance(n: int):
-        report, seconds = timed(lambda: plain(n))
-        spent.append(seconds)
-        return report
-
-    with patched(sim, "advance", advance):
-        done = sim.run(seconds, fps=None)
-    s = sim.settings
-    run = Run(name, f"{s.integrator}, dt = {1e3 * s.dt:.3g} ms", done.status, done.problems, done.sim_seconds, done.wall_seconds)
-    for report, took in zip(done.step_reports, spent):
-        if report.n_contacts:
-            run.seconds.append(took)
-            run.contacts.append(report.n_contacts)
-            run.outer.append(report.contact_iterations)
-            run.newton.append(report.newton_iterations)
-            run.linear.append(report.linear_iterations)
-    return run

@@ -3,11 +3,12 @@
 taisoft bench report [--quick] [--arch cpu|cuda] [--only NAME] [--out DIR]
 
 The page is DIR/README.md, with pictures and all numbers (report.json) beside it. Scenes are ours, since the report gives few
-sizes and neither its machine nor its materials. The numbers decide whether a claim holds; a part agrees, disagrees or partly
-agrees. Times are medians without compilation; spread is the interquartile range over the median. A second run into the same
-folder lists the times that differ by more than the spreads. Exit status: 0, or 1 if a part could not be measured; verdicts do not
-matter. --quick has fewer scenes, sizes and rounds; it and --only write files only with --out. A full run takes about twelve
-minutes on two cores.
+sizes and neither its machine nor its materials. The search and the contact solve are judged by the numbers of `taisoft bench
+collision` and `taisoft bench contact` in benchmarks/results, which are run first if they are not there; the rest is measured
+here. The numbers decide whether a claim holds; a part agrees, disagrees or partly agrees. Times are medians without compilation;
+spread is the interquartile range over the median. A second run into the same folder lists the times that differ by more than the
+spreads. Exit status: 0, or 1 if a part could not be measured; verdicts do not matter. --quick has fewer scenes, sizes and rounds,
+and measures everything; it and --only write files only with --out. A full run takes about six minutes on two cores.
 """
 
 import os
@@ -27,18 +28,31 @@ from taisoft.output.tables import require_matplotlib
 
 from .document import again_text, default_out, earlier_numbers, header, load_text, plain
 from .report_parts import bound, demos, phases, points, search, solvers
-from .report_parts.page import Extent, Part, part_text, short_text, summary_table
+from .report_parts.page import Extent, Part, numbers_of, part_text, short_text, summary_table
 from .runner import add_arch, make_parser
+
+
+def judged(benchmark: str, judge: Callable[[dict], Part]) -> Callable[[Extent], Part]:
+    """What makes a part of the numbers of another benchmark."""
+
+    def measure(extent: Extent) -> Part:
+        numbers = numbers_of(benchmark, extent.quick, extent.arch)
+        part = judge(numbers)
+        part.method += f" The numbers are those of `taisoft bench {benchmark}`, {numbers['date']}."
+        return part
+
+    return measure
+
 
 PARTS: dict[str, Callable[[Extent], Part]] = {
     "demos": demos.measure,
-    "phases": phases.measure,
+    "phases": judged("contact", phases.phases),
     "points": points.measure,
-    "reduction": search.measure_reduction,
-    "broad": search.measure_broad_phases,
-    "cells": search.measure_cells,
-    "colours": solvers.measure_colours,
-    "solvers": solvers.measure_solvers,
+    "reduction": judged("collision", search.reduction),
+    "broad": judged("collision", search.broad),
+    "cells": judged("collision", search.cells),
+    "colours": judged("contact", solvers.colours),
+    "solvers": judged("contact", solvers.solvers),
     "bound": bound.measure,
 }
 PAGE, NUMBERS = "README.md", "report.json"

@@ -20,37 +20,20 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from taisoft.errors import OutputError, SimulationError
-from taisoft.output.tables import percent, require_matplotlib, save, spread_of, ticks
+from taisoft.output.tables import percent, spread_of
 
-from .document import again_text, begin, earlier_numbers, exponent, plain, table
-from .runner import make_parser, parse_options, parse_result, print_result, progress, run_python
+from .charts import Panel, write_plot
+from .children import in_child
+from .document import again_text, begin, earlier_numbers, exponent, table
+from .runner import make_parser, parse_options, progress
 from .scaling_bytes import GROUPS, Copy, copy_rate, measure_copy
 from .scaling_runs import KINDS, ON_ONE, PRECISION, Row, measure
 
 SIZES, QUICK_SIZES, LARGEST = (1_000, 4_000, 16_000, 64_000, 276_000), (500, 2_000), 1_000_000
 LARGEST_OF = ("explicit", "implicit", "stiff implicit")  # kinds measured with it
-COPY = "copy"
-COLOURS = ("#0072b2", "#56b4e9", "#d55e00", "#009e73", "#cc79a7", "#e69f00")
-PANEL = (4.6, 3.6)  # inches
 
 
-# --- processes ----------------------------------------------------------------------------------------------------------
-
-
-def answer(job: str, arch: str) -> None:
-    """In a child: measure "copy" or "kind:size", and print the result."""
-    kind, _, size = job.rpartition(":")
-    print_result(plain(measure_copy(arch) if job == COPY else measure(kind, int(size), arch)))
-
-
-def run_child(job: str, arch: str) -> list | dict | str:
-    """The result of a child, or a sentence about its failure."""
-    progress(job)
-    try:
-        lines = run_python(job, "-m", "taisoft", "bench", "scaling", "--child", job, "--arch", arch)
-    except SimulationError as error:
-        return str(error)
-    return [found for line in lines if (found := parse_result(line)) is not None][-1]
+# --- measured -----------------------------------------------------------------------------------------------------------
 
 
 def measure_all(kinds: list[str], sizes: list[int], arch: str, chosen: bool = True) -> Iterator[Row]:
@@ -64,8 +47,11 @@ def measure_all(kinds: list[str], sizes: list[int], arch: str, chosen: bool = Tr
         for size in several.get(kind.removesuffix(ON_ONE), []) if one else sizes:
             if size == LARGEST and not chosen and kind.removesuffix(ON_ONE) not in LARGEST_OF:
                 continue
-            found = run_child(f"{kind}:{size}", arch)
-            row = Row(kind, arch, tets=size, failure=found) if isinstance(found, str) else Row(**found)
+            progress(f"{kind}, {size:,} tets")
+            try:
+                row = Row(**in_child(f"{kind}:{size}", measure, kind, size, arch))
+            except SimulationError as error:
+                row = Row(kind, arch, tets=size, failure=str(error))
             if row.threads > 1 and arch == "cpu":
                 several.setdefault(kind, []).append(size)
             yield row
@@ -145,13 +131,13 @@ def time_table(rows: Sequence[Row]) -> str:
 
 
 def phase_table(rows: Sequence[Row]) -> str:
-    """Fraction of time per phase."""
+    """Fraction of time by kind, without those below 0.5 %."""
 
     def fractions(row: Row) -> str:
-        whole = sum(row.phases.values())
-        return ", ".join(f"{name} {seconds / whole:.0%}" for name, seconds in row.phases.items())
+        parts = {kind: seconds / sum(row.phases.values()) for kind, seconds in row.phases.items()}
+        return ", ".join(f"{kind} {part:.0%}" for kind, part in parts.items() if part >= 0.005)
 
-    return table(measured(rows), (*WORK, ("<fraction of each phase", fractions)))
+    return table(measured(rows), (*WORK, ("<fraction of each kind", fractions)))
 
 
 def call_table(rows: Sequence[Row]) -> str:
@@ -214,37 +200,22 @@ def growth_table(found: Sequence[Growth]) -> str:
 
 def draw(rows: Sequence[Row], copies: Sequence[Copy], path: Path) -> None:
     """Write a PNG. Raises OutputError."""
-    require_matplotlib()
-    from matplotlib import pyplot
-
-    rows = measured(rows)
+    rows = sorted(measured(rows), key=lambda row: row.tets)
     if not rows:
         raise OutputError(f"{path}: there is nothing to draw, since nothing could be measured")
-    panels: tuple[tuple[str, Callable[[Row], float]], ...] = (
-        ("time of a step or a search [ns/tet]", lambda row: 1e9 * row.timing.median / row.tets),
-        ("moved at least [GB/s]", lambda row: 1e-9 * row.moved / row.timing.median),
-        ("fields [B/tet]", lambda row: sum(row.field_bytes.values()) / row.tets),
-    )
-    figure, axes = pyplot.subplots(1, 3, figsize=(3 * PANEL[0], PANEL[1] + 0.4), layout="constrained")
-    for axis, (title, value) in zip(axes, panels):
-        for kind, colour in zip((kind for kind in KINDS if not kind.endswith(ON_ONE)), COLOURS, strict=True):
-            own = sorted((row for row in rows if row.kind == kind), key=lambda row: row.tets)
-            if not own:
-                continue
-            axis.plot([row.tets for row in own], [value(row) for row in own], "o-", color=colour, ms=4, lw=1.5, label=kind)
-        axis.set(xscale="log", yscale="log", title=title, xlabel="tets")
-        values = [value(row) for row in rows]
-        ticks(axis.yaxis, max(values) / min(values))
-        ticks(axis.xaxis, max(row.tets for row in rows) / min(row.tets for row in rows))
-        axis.xaxis.set_major_formatter("{x:,.0f}")
-        axis.grid(True, which="major", color="#eeeeee")
-        axis.set_axisbelow(True)
+    panels: dict[str, Callable[[Row], float]] = {
+        "time of a step or a search [ns/tet]": lambda row: 1e9 * row.timing.median / row.tets,
+        "moved at least [GB/s]": lambda row: 1e-9 * row.moved / row.timing.median,
+        "fields [B/tet]": lambda row: sum(row.field_bytes.values()) / row.tets,
+    }
+    drawn = [Panel(title, "tets", log="xy") for title in panels]
+    for panel, value in zip(drawn, panels.values()):
+        for k, kind in enumerate(kind for kind in KINDS if not kind.endswith(ON_ONE)):
+            if own := [row for row in rows if row.kind == kind]:
+                panel.curve([row.tets for row in own], [value(row) for row in own], kind, k)
     for n in sorted({copy.threads for copy in copies}):
-        line = axes[1].axhline(1e-9 * copy_rate(copies, n), color="#555555", lw=0.9, ls="--" if n == 1 else ":")
-        line.set_label(f"a copy, {n} thread{'s' if n > 1 else ''}")
-    handles, labels = axes[1].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside upper center", ncols=len(labels), frameon=False, fontsize=8)
-    save(figure, path)
+        drawn[1].level("y", 1e-9 * copy_rate(copies, n), f"a copy, {n} thread{'s' * (n > 1)}", ls="--" if n == 1 else ":")
+    write_plot(path, drawn)
 
 
 # --- the whole ----------------------------------------------------------------------------------------------------------
@@ -267,17 +238,10 @@ def main(argv=None) -> int:
     parser.add_argument("--quick", action="store_true", help="two small meshes of each kind")
     parser.add_argument("--sizes", type=size_list, metavar="LIST", help="numbers of tets; the nearest meshes are taken")
     parser.add_argument("--kind", choices=KINDS, metavar="NAME", help=f"only this one of {', '.join(KINDS)}")
-    parser.add_argument("--child", metavar="JOB", help=argparse.SUPPRESS)
     options = parse_options(parser, argv, "time, bytes per second and memory over the tets")
-    if options.child:
-        answer(options.child, options.arch)
-        return 0
     sizes = options.sizes or list(QUICK_SIZES if options.quick else (*SIZES, LARGEST))
     document, numbers = begin("Scaling", options.arch, PRECISION)
-    copies = run_child(COPY, options.arch)
-    if isinstance(copies, str):
-        raise SimulationError(copies)
-    copies = [Copy(**copy) for copy in copies]
+    copies = [Copy(**copy) for copy in in_child("copies of memory", measure_copy, options.arch)]
     kinds = [kind for kind in KINDS if options.kind in (None, kind, kind.removesuffix(ON_ONE))]
     rows = list(measure_all(kinds, sizes, options.arch, options.sizes is not None))
     found = growths(rows)

@@ -7,10 +7,11 @@ explicit contact, implicit contact: two cubes on the ground, the upper one off c
             Euler and Gauss-Seidel at 0.9 of the largest stable step, implicit Euler and the augmented Lagrangian at 10 ms.
 
 Explicit, implicit, search and implicit contact also on one thread, where taisoft uses all. All in f32. Steps are timed first as a
-whole, then repeated from the same start with a stopwatch on their parts and with counters, which adds a small overhead. The first
-steps, which compile and grow buffers, are left out.
+whole, then repeated from the same start with counters, and with their launches timed by kind (kinds.py). The first steps, which
+compile and grow buffers, are left out.
 """
 
+from collections import Counter
 from collections.abc import Callable
 from contextlib import closing
 from dataclasses import asdict, dataclass, field, replace
@@ -18,27 +19,20 @@ from functools import partial
 from time import perf_counter
 
 import numpy as np
-import taichi as ti
 
 import taisoft as ts
-from taisoft.backend import parallel
 from taisoft.backend.counters import counting
-from taisoft.backend.runtime import compile_clock, kernel, open_runtime, threads
-from taisoft.dynamics import dynamics, stage_system
-from taisoft.fem.lanes import broadcast
-from taisoft.fem.state import LOWEST_J
-from taisoft.fem.terms.elasticity import HUGE, elastic_forces, element_force
-from taisoft.linear import block_csr, pcg
+from taisoft.backend.runtime import compile_clock, open_runtime, threads
 from taisoft.machine import Timing, summarise
 from taisoft.output.report import peak_memory
 from taisoft.scene.scene import Scene
 
 from .beam import MARGIN, beam_scene, n_tets
 from .collision_cases import pile_setup, two_cubes
-from .collision_runs import Rig
-from .contact_runs import explicit_places
-from .elasticity_steps import LONGEST_FALL, MAX_STEPS, SAMPLE_SECONDS
-from .runner import Stopwatch, clock, patched, repeated, timed, warm_up
+from .collision_rig import Rig, on_one_thread
+from .elasticity import LONGEST_FALL, MAX_STEPS, SAMPLE_SECONDS
+from .kinds import watching
+from .runner import clock, repeated, timed, warm_up
 from .scaling_bytes import floor_bytes, group_bytes
 from .timed_run import advance
 
@@ -54,7 +48,7 @@ STIFF = 1e8  # [Pa]
 
 @dataclass
 class Row:
-    """A kind of work on one mesh. samples: seconds of a step or a search; phases: median seconds per phase; counts: means; calls:
+    """A kind of work on one mesh. samples: seconds of a step or a search; phases: seconds by kind; counts: means; calls:
     launches, their arguments and accesses by the host, means; moved: lower bound of the bytes moved; field_bytes: by group; base,
     peak: resident bytes before the scene was built, and at most; setup_seconds: of building scene and simulator, without
     compilation."""
@@ -136,14 +130,26 @@ def _open(row: Row, build: Callable[[int], Scene], size: int, integrator: str, d
 # --- kinds of work ----------------------------------------------------------------------------------------------------
 
 
-def on_one_thread(run: Callable[[Row, int], None]) -> Callable[[Row, int], None]:
+def alone(run: Callable[[Row, int], None]) -> Callable[[Row, int], None]:
     """A kind of work on one thread for any mesh size."""
 
     def on_one(row: Row, size: int) -> None:
-        with patched(parallel, "pays", lambda seconds: False):
+        with on_one_thread():
             run(row, size)
 
     return on_one
+
+
+def _look(row: Row, begin: Callable[[], object], call: Callable[[], object], times: int) -> Counter[str]:
+    """Repeat a call with counters and by kind, both from what `begin` does. Returns the launches by kernel, over `times`."""
+    begin()
+    with counting() as counts:
+        call()
+    begin()
+    with watching() as spend:
+        row.phases = spend(call, times).seconds
+    row.calls = counts.totals(times)
+    return Counter({name: n / times for name, n in counts.launches.items()})
 
 
 def explicit(row: Row, size: int) -> None:
@@ -153,78 +159,27 @@ def explicit(row: Row, size: int) -> None:
         a_few = advance(sim, 10).seconds / 10
         steps = max(MIN_STEPS, min(MAX_STEPS, round(SAMPLE_SECONDS / a_few)))
         sim.dt = min(sim.dt, LONGEST_FALL / steps)
-        _element_seconds(sim, steps)  # compiles
-        fractions = []
-        for _ in range(SAMPLES):  # in turn, so that a slow moment of the machine affects both
+        for _ in range(SAMPLES):
             sim.reset()
             row.samples.append(advance(sim, steps).seconds / steps)
-            fractions.append(min(1.0, _element_seconds(sim, steps) / row.samples[-1]))
-        sim.reset()
-        with counting() as counts:
-            advance(sim, steps)
-        row.calls = counts.totals(steps)
-        elements = float(np.median(fractions)) * row.timing.median
-        row.phases = {"elements": elements, "nodes": row.timing.median - elements}
+        _look(row, sim.reset, lambda: advance(sim, steps), steps)
         row.field_bytes = group_bytes(sim)
         row.moved = floor_bytes(("drift", "elements", "nodes"), sim.field_bytes)
-
-
-@kernel
-def repeat_elements(m: ti.template(), n: ti.i32):
-    """The element loop of an explicit step n times on one thread; scalars: LOWEST_J of a lane."""
-    ti.loop_config(serialize=True)
-    for _ in range(1):
-        low = broadcast(ti.cast(HUGE, m.real), m.lanes)
-        for _k in range(n):
-            for g in ti.static(m.groups):
-                for b in range(g.first, g.last):
-                    low = ti.min(low, element_force(m, g, False, b))
-        m.state.scalars[LOWEST_J] = low[0]
-
-
-def _element_seconds(sim: ts.Simulator, n: int) -> float:
-    """Seconds of the element loop of a step, averaged over n runs."""
-    m, begin = sim._dynamics.state.model, clock()
-    if m.serial:
-        repeat_elements(m, n)
-    else:
-        for _ in range(n):
-            elastic_forces(m)
-    return (clock() - begin) / n
 
 
 def explicit_contact(row: Row, size: int) -> None:
     """Steps with contacts, each with a search and a solve."""
     with _open(row, cubes_on_ground, size, "symplectic_euler", None) as sim:
-        _one_by_one(row, sim, explicit_places(sim))
-        row.field_bytes = group_bytes(sim)
+        _one_by_one(row, sim)
         sweep = floor_bytes(("sweep",), sim.field_bytes) * row.counts["contacts"] / sim._dynamics.contact.problem.capacity
         row.moved = floor_bytes(("elements", "update"), sim.field_bytes) + sweep * row.counts["sweeps"]
-
-
-def implicit_places(sim: ts.Simulator) -> list[tuple[str, object, str]]:
-    """The functions of each part of implicit steps, for `Stopwatch.on`."""
-    places = [
-        *(("residual", stage_system, name) for name in ("move", "update_impulses", "form_residual")),
-        *(("matrix", block_csr, name) for name in ("assemble", "to_system")),
-        ("matrix", stage_system, "save_diagonal"),
-        ("linear solve", pcg, "solve"),
-        ("report", dynamics, "measure"),
-    ]
-    contact = sim._dynamics.contact
-    if contact is not None:
-        places += [("search", contact.detection, "find"), ("search", contact.measures, "closing"), ("problem", contact, "begin")]
-        places.append(("problem", stage_system, "find_factors"))
-    return places
 
 
 def implicit(build: Callable[[int], Scene], integrator: str, row: Row, size: int) -> None:
     """Implicit steps with or without contacts; bytes moved exclude those of contacts."""
     with _open(row, build, size, integrator, DT) as sim:
-        watch = _one_by_one(row, sim, implicit_places(sim))
-        fields, steps = sim.field_bytes, len(row.samples)
-        row.field_bytes = group_bytes(sim)
-        row.counts |= {"residuals": watch.calls["form_residual"] / steps, "matrices": watch.calls["assemble"] / steps}
+        launches, fields = _one_by_one(row, sim), sim.field_bytes
+        row.counts |= {"residuals": launches["form_residual"], "matrices": launches["assemble"]}
         row.moved = (
             row.counts["residuals"] * floor_bytes(("elements", "residual"), fields)
             + row.counts["matrices"] * floor_bytes(("blocks", "edges", "system"), fields)
@@ -232,8 +187,8 @@ def implicit(build: Callable[[int], Scene], integrator: str, row: Row, size: int
         )
 
 
-def _one_by_one(row: Row, sim: ts.Simulator, places: list[tuple[str, object, str]]) -> Stopwatch:
-    """Time steps one by one, then the same steps by their parts."""
+def _one_by_one(row: Row, sim: ts.Simulator) -> Counter[str]:
+    """Time steps one by one, then look at them. Returns the launches of a step by kernel."""
     reports = []
     _warm(sim)
     while len(row.samples) < MIN_TIMED or (sum(row.samples) < ENOUGH_SECONDS and len(row.samples) < MAX_TIMED):
@@ -243,13 +198,8 @@ def _one_by_one(row: Row, sim: ts.Simulator, places: list[tuple[str, object, str
     if not all(report.converged for report in reports):
         row.failure = "not every step converged"
     row.counts = {name: float(np.mean([getattr(report, own) for report in reports])) for name, own in COUNTS.items()}
-    _warm(sim)
-    watch = Stopwatch()
-    with watch.on(places), counting() as counts:
-        parts = [watch.parts_of(sim.step) for _ in row.samples]
-    row.calls = counts.totals(len(parts))
-    row.phases = {part: float(np.median([one.get(part, 0.0) for one in parts])) for part in {p: 0 for one in parts for p in one}}
-    return watch
+    row.field_bytes = group_bytes(sim)
+    return _look(row, partial(_warm, sim), lambda: [sim.step() for _ in reports], len(reports))
 
 
 def _warm(sim: ts.Simulator) -> None:
@@ -260,7 +210,7 @@ def _warm(sim: ts.Simulator) -> None:
 
 
 def search(row: Row, size: int) -> None:
-    """Whole searches, and their phases."""
+    """Whole searches."""
     setup = pile_setup(max(1, round((size / (27 * 6)) ** (1 / 3))))
     with closing(open_runtime(row.arch, PRECISION, "the benchmark of scaling")) as runtime:
         rig, row.setup_seconds = timed(lambda: Rig(setup, "proximity", runtime))
@@ -270,11 +220,7 @@ def search(row: Row, size: int) -> None:
             for _ in range(2):
                 rig.search()
             row.samples = repeated(rig.search, ROUNDS)
-            with counting() as counts:
-                rig.search()
-            row.calls = counts.totals()
-            taken = [rig.phases() for _ in row.samples]
-            row.phases = {name: float(np.median([one[name] for one in taken])) for name in taken[0]}
+            _look(row, lambda: None, lambda: [rig.search() for _ in row.samples], len(row.samples))
             counts, found = rig.detection.counts, rig.detection.field_bytes
             row.counts = {"triangles": counts.triangles, "found": counts.found, "contacts": counts.contacts}
             row.field_bytes = {"search": sum(found.values())}
@@ -286,9 +232,9 @@ _implicit_contact = partial(implicit, cubes_on_ground, "implicit_euler")
 _THREADED = {"explicit": explicit, "implicit": partial(implicit, beam, "bdf2"), "search": search}
 KINDS: dict[str, Callable[[Row, int], None]] = {
     **_THREADED,
-    **{name + ON_ONE: on_one_thread(run) for name, run in _THREADED.items()},
+    **{name + ON_ONE: alone(run) for name, run in _THREADED.items()},
     "stiff implicit": partial(implicit, stiff_beam, "bdf2"),
     "explicit contact": explicit_contact,
     "implicit contact": _implicit_contact,
-    "implicit contact" + ON_ONE: on_one_thread(_implicit_contact),
+    "implicit contact" + ON_ONE: alone(_implicit_contact),
 }

@@ -7,7 +7,7 @@ machine, which may be one in software. First a run without a window, which also 
 the window by the clock, and a body is dragged to and fro by the mouse (xdotool); then both once more, with a budget of wall time
 for its implicit steps. Speeds are simulated over wall time: the window's is 1 at most. The latency is the wall time from the last
 look at the mouse that did not see a movement to a picture of a state whose step has used it. Run nothing else meanwhile.
-Last, the run without a window is repeated with all launches timed, for a table of what its steps spend, see `window_kinds`.
+Last, the run without a window is repeated with all launches timed, for a table of what its steps spend, see `kinds.py`.
 Exit status: 0, or 1 if fewer than 20 pictures per second are shown, or the latency is above 100 ms where the simulation keeps up
 with the clock, without a budget.
 """
@@ -21,11 +21,13 @@ import numpy as np
 from taisoft.cli.scene_file import load_scene, shipped_files
 from taisoft.errors import MissingPackage
 
+from . import window_child
+from .children import in_child
 from .document import Limit, begin, check_out, table
-from .runner import make_parser, parse_result, progress, run_python, without_warnings
+from .kinds import JOINED
+from .runner import make_parser, progress, without_warnings
 from .virtual_display import VirtualDisplay
 
-CHILD = Path(__file__).with_name("window_child.py")
 MAX_TETS = 5000
 QUICK = ("cube_on_box",)
 PICTURES, LATENCY = 20.0, 0.1  # required pictures per second; latency [s]
@@ -49,9 +51,7 @@ def demos() -> list[str]:
 
 def measure(name: str, display: VirtualDisplay) -> dict:
     """Results of a demo, see `window_child.py`. Raises SimulationError if its process fails."""
-    lines = run_python(name, CHILD, name, environment=display.environment)
-    (result,) = [found for line in lines if (found := parse_result(line)) is not None]
-    return {"demo": name} | result
+    return {"demo": name} | in_child(name, window_child.measure, name, environment=display.environment)
 
 
 def pictures_per_second(row: dict) -> float:
@@ -99,7 +99,7 @@ def kinds_table(rows: list[dict]) -> str:
         ("<demo", "{[demo]}"),
         ("step without window [ms]", lambda row: f"{1e3 * row['alone_step']:.3g}"),
         ("sum of kinds", lambda row: f"{1e3 * sum(row['kinds']['seconds'].values()):.3g}"),
-        *((f"{kind} [%]", percent_of(kind)) for kind in rows[0]["kinds"]["seconds"]),
+        *((f"{kind} [%]", percent_of(kind)) for kind in JOINED),
         ("launches", lambda row: f"{sum(row['kinds']['launches'].values()):,.0f}"),
     )
     return table(rows, columns)

@@ -1,24 +1,20 @@
-"""One demo in a live window: `python window_child.py NAME` prints its times; the display is that of the environment.
+"""A child process of `taisoft bench window`: one demo in a live window on the display of the environment.
 
 The result holds: tets; dt [s]; alone, the speed of a run without a window; without a budget of wall time for its steps and, under
 "budget", with one: speed, that of the same time in the window; step and longest_step, median and largest wall time of its steps
 [s]; intervals, times between its pictures [s]; latencies of the drag [s]; ended, the fraction of steps that ended on budget;
-residual, the largest of these. "kinds" holds what a step without a window spends, see `window_kinds.spend`; alone_step, the mean
-step of the run without a window [s], checks their sum.
+residual, the largest of these. "kinds" holds what a step without a window spends, see `kinds.py`; alone_step, the mean step of
+the run without a window [s], checks their sum.
 """
 
 import itertools
-import json
 import subprocess
-import sys
 import time
-import warnings
 from statistics import median
 
 import numpy as np
 
 import taisoft as ts
-from benchmarks.window_kinds import spend
 from taisoft.cli.scene_file import load_scene
 from taisoft.output.viewpoint import Viewpoint
 from taisoft.view.live import LiveRun
@@ -26,6 +22,9 @@ from taisoft.view.picking import pick
 from taisoft.view.sampling import Sampler
 from taisoft.view.screen import MESSAGES, PANEL, SIZE, free_part
 from taisoft.view.window import WindowProcess
+
+from .kinds import watching
+from .runner import without_warnings
 
 LONGEST = 60.0  # wall time of the run in the window [s]
 DRAGS, PAUSE, PIXELS = 250, 0.02, 4  # movements of the mouse, time between two [s], size
@@ -89,7 +88,7 @@ def measure(name: str) -> dict:
     """Return the results of a demo."""
     scene, settings = load_scene(name)
     seconds, fps = settings.pop("seconds", 1.0), settings.pop("fps", 60.0)
-    with ts.Simulator(scene, draggable=True, **settings) as sim:
+    with without_warnings(), ts.Simulator(scene, draggable=True, **settings) as sim:
         sim.run(seconds, fps=fps)  # compiles
         sim.drag(scene.bodies[0].name, [0], [1.0], sim.positions()[0], 1.0)
         sim.step()
@@ -104,7 +103,10 @@ def measure(name: str) -> dict:
         }
         found |= in_window(sim, seconds, budget=False) | {"budget": in_window(sim, seconds, budget=True)}
         sim.budget = settings.get("budget")  # not that of the window
-        return found | {"kinds": spend(sim, seconds, fps)}
+        sim.reset()
+        with watching() as spend:
+            spent = spend(lambda: sim.run(seconds, fps=fps), report.steps)
+        return found | {"kinds": {"seconds": spent.joined(), "launches": spent.launches}}
 
 
 def in_window(sim: ts.Simulator, seconds: float, budget: bool) -> dict:
@@ -139,8 +141,3 @@ def in_window(sim: ts.Simulator, seconds: float, budget: bool) -> dict:
         "ended": float((residuals > 0.0).mean()),
         "residual": float(residuals.max()),
     }
-
-
-if __name__ == "__main__":
-    warnings.simplefilter("ignore", UserWarning)
-    print("result: " + json.dumps(measure(sys.argv[1])), flush=True)

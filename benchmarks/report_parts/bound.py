@@ -12,10 +12,11 @@ import numpy as np
 import taisoft as ts
 from taisoft.errors import SimulationError
 
+from ..charts import Panel
 from ..document import exponent, table
 from ..runner import without_warnings
 from ..timed_run import advance
-from .page import COLOURS, Claim, Extent, Part, is_near, new_figure, plot_png
+from .page import Claim, Extent, Part, is_near, plot_png
 
 EXPLICIT, IMPLICIT = "symplectic_euler", "implicit_euler"
 YOUNGS = (1e4, 1e5, 1e6, 1e7, 1e8, 1e9), (1e4, 1e6, 1e9)  # [Pa], in a full and in a quick run
@@ -24,10 +25,11 @@ DENSITIES = (100.0, 1000.0, 10000.0)  # [kg/m^3]
 YOUNG, DENSITY, MESH = 1e6, 1000.0, 3  # defaults when another parameter varies
 STEPS, GROWTH, KICK = 600, 100.0, 1e-6
 PRECISE = 1e-3  # relative width at which the bisection ends
-SEED = 5
 STRETCH, LONG = 0.1, 50  # initial stretch and steps of a long run
-FACTORS = (1.0, 10.0, 100.0, 1000.0)  # steps of implicit Euler over the explicit limit
-AROUND = (0.25, 0.5, 0.8, 0.95, 1.05, 1.2, 2.0)  # steps of symplectic Euler over the limit
+FACTORS = {  # dt of long runs over the explicit limit
+    EXPLICIT: (0.25, 0.5, 0.8, 0.95, 1.05, 1.2, 2.0),
+    IMPLICIT: (1.0, 10.0, 100.0, 1000.0),
+}
 BOUNDED = 3.0  # displacement of a stable run over the initial one, at most
 FAR = 1e3  # the same, at which the picture is cut
 LOOSE = 0.1  # tolerance of a measured exponent
@@ -60,83 +62,69 @@ class LongRun:
         return self.reach <= BOUNDED
 
 
-class Cube:
-    """A unit cube of n^3 cells, held on one side; a context manager. Unstable steps are allowed without warnings."""
-
-    def __init__(self, cells: int, integrator: str, arch: str, young: float = YOUNG):
-        scene = ts.Scene(gravity=(0.0, 0.0, 0.0))
-        material = ts.Material(young=young, poisson=0.3, density=DENSITY)
-        body = scene.add_body(ts.box_mesh((cells,) * 3, (1.0, 1.0, 1.0), pattern="six"), material, name="cube")
-        body.fix(lambda X: X[:, 0] < -0.5 + 1e-9)
-        explicit = integrator == EXPLICIT
-        self.cells, self.rest, self.young, self.density = cells, body.rest_positions, young, DENSITY
-        with without_warnings():
-            self.sim = ts.Simulator(scene, 1e-5, integrator, precision="f64", arch=arch, allow_unstable=explicit)
-
-    def __enter__(self) -> "Cube":
-        return self
-
-    def __exit__(self, *error) -> None:
-        self.sim.close()
-
-    def set(self, young: float = YOUNG, density: float = DENSITY) -> None:
-        """Change the material."""
-        self.young, self.density = young, density
-        with without_warnings():
-            self.sim.set_material("cube", young=young, density=density)
-
-    def _begin(self, dt: float, positions: np.ndarray | None = None, velocities: np.ndarray | None = None) -> None:
-        self.sim.reset()
-        with without_warnings():
-            self.sim.dt = dt
-        self.sim.set_state(positions, velocities)
-
-    def largest_displacement(self) -> float:
-        """Largest displacement of a node [m]."""
-        return float(np.linalg.norm(self.sim.positions("cube") - self.rest, axis=1).max())
-
-    def is_stable(self, dt: float) -> bool:
-        """Whether small vibrations stay small."""
-        sound = np.sqrt(self.young / self.density)
-        kick = KICK * sound * np.random.default_rng(SEED).standard_normal(self.rest.shape)
-        self._begin(dt, self.rest, kick)
-        try:
-            advance(self.sim, STEPS)
-        except SimulationError:
-            return False
-        return self.largest_displacement() < GROWTH * KICK  # [m]: the cube is 1 m long
-
-    def limit(self) -> Limit:
-        """Find the limit by bisection, from an interval found by doubling."""
-        low = 0.1 / self.cells * np.sqrt(self.density / self.young)
-        while not self.is_stable(low):
-            low *= 0.5
-        high = 2.0 * low
-        while self.is_stable(high):
-            low, high = high, 2.0 * high
-        while high - low > PRECISE * low:
-            middle = 0.5 * (low + high)
-            low, high = (middle, high) if self.is_stable(middle) else (low, middle)
-        return Limit(self.cells, self.young, self.density, low, self.sim.stable_dt)
-
-    def long_run(self, factor: float, limit: float) -> LongRun:
-        """Release the cube from a stretch, with dt = factor * limit [s]."""
-        X = self.rest
-        start = X + STRETCH * (X[:, :1] + 0.5) * np.array([1.0, 0.0, 0.0])
-        dt = factor * limit
-        self._begin(dt, start, np.zeros_like(X))
-        before, reach = self.largest_displacement(), 0.0
-
-        def on_frame(_sim, _index, _report) -> None:
-            nonlocal reach
-            reach = max(reach, self.largest_displacement() / before)
-
-        done = self.sim.run(LONG * dt, on_frame, fps=None)
-        reach = np.inf if done.status == "failed" else reach
-        return LongRun(self.sim.settings.integrator, self.young, factor, float(reach), done.status)
+def open_cube(cells: int, integrator: str, arch: str) -> ts.Simulator:
+    """A simulator of a unit cube of n^3 cells, held on one side, which allows unstable steps."""
+    scene = ts.Scene(gravity=(0.0, 0.0, 0.0))
+    material = ts.Material(young=YOUNG, poisson=0.3, density=DENSITY)
+    body = scene.add_body(ts.box_mesh((cells,) * 3, (1.0, 1.0, 1.0), pattern="six"), material, name="cube")
+    body.fix(lambda X: X[:, 0] < -0.5 + 1e-9)
+    return ts.Simulator(scene, 1e-5, integrator, precision="f64", arch=arch, allow_unstable=integrator == EXPLICIT)
 
 
-# --- what it says -----------------------------------------------------------------------------------------------------
+def rest_of(sim: ts.Simulator) -> np.ndarray:
+    """The nodes (n,3) [m] at rest."""
+    return sim.scene.bodies[0].rest_positions
+
+
+def largest_displacement(sim: ts.Simulator) -> float:
+    """Largest displacement of a node [m]."""
+    return float(np.linalg.norm(sim.positions() - rest_of(sim), axis=1).max())
+
+
+def is_stable(sim: ts.Simulator, dt: float, sound: float) -> bool:
+    """Whether small vibrations stay small. sound: its speed [m/s]."""
+    sim.reset()
+    sim.dt = dt
+    sim.set_state(rest_of(sim), KICK * sound * np.random.default_rng(5).standard_normal(rest_of(sim).shape))
+    try:
+        advance(sim, STEPS)
+    except SimulationError:
+        return False
+    return largest_displacement(sim) < GROWTH * KICK  # [m]: the cube is 1 m long
+
+
+def find_limit(sim: ts.Simulator, cells: int, young: float = YOUNG, density: float = DENSITY) -> Limit:
+    """Find the limit of a cube of this material by bisection, from an interval found by doubling."""
+    sim.set_material("cube", young=young, density=density)
+    sound = np.sqrt(young / density)
+    low = 0.1 / cells / sound
+    while not is_stable(sim, low, sound):
+        low *= 0.5
+    high = 2.0 * low
+    while is_stable(sim, high, sound):
+        low, high = high, 2.0 * high
+    while high - low > PRECISE * low:
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if is_stable(sim, middle, sound) else (low, middle)
+    return Limit(cells, young, density, low, sim.stable_dt)
+
+
+def long_runs(sim: ts.Simulator, limit: Limit) -> list[LongRun]:
+    """Release the cube of a limit from a stretch, with multiples of that dt."""
+    sim.set_material("cube", young=limit.young, density=limit.density)
+    X, found = rest_of(sim), []
+    for factor in FACTORS[sim.settings.integrator]:
+        sim.reset()
+        sim.dt = factor * limit.measured
+        sim.set_state(X + STRETCH * (X[:, :1] + 0.5) * np.array([1.0, 0.0, 0.0]), np.zeros_like(X))
+        reaches = [largest_displacement(sim)]
+        done = sim.run(LONG * sim.dt, lambda sim, *_, reaches=reaches: reaches.append(largest_displacement(sim)), fps=None)
+        reach = np.inf if done.status == "failed" else max(reaches) / reaches[0]
+        found.append(LongRun(sim.settings.integrator, limit.young, factor, float(reach), done.status))
+    return found
+
+
+# --- what it says -------------------------------------------------------------------------------------------------------
 
 
 def claims_of(youngs: list[Limit], sizes: list[Limit], densities: list[Limit], runs: list[LongRun]) -> list[Claim]:
@@ -144,12 +132,11 @@ def claims_of(youngs: list[Limit], sizes: list[Limit], densities: list[Limit], r
     by_young, off = exponent([x.young for x in youngs], [x.measured for x in youngs])
     by_size, _ = exponent([1.0 / x.cells for x in sizes], [x.measured for x in sizes])
     by_density, _ = exponent([x.density for x in densities], [x.measured for x in densities])
-    explicit = [r for r in runs if r.integrator == EXPLICIT]
+    beyond = [r for r in runs if r.integrator == EXPLICIT and r.factor > 1.0]
+    below = [r for r in runs if r.integrator == EXPLICIT and r.factor < 1.0]
     implicit = [r for r in runs if r.integrator == IMPLICIT]
-    beyond = [r for r in explicit if r.factor > 1.0]
     good = [r.stable and r.status == "ok" for r in implicit]
     apart = max(abs(x.measured / x.stable_dt - 1.0) for x in (*youngs, *sizes, *densities))
-    square = is_near(by_size, 2.0, LOOSE)
     return [
         Claim(
             "the largest stable step of semi-implicit Euler falls like E^-1/2.",
@@ -164,34 +151,29 @@ def claims_of(youngs: list[Limit], sizes: list[Limit], densities: list[Limit], r
         ),
         Claim(
             "it grows like (h m)^1/2, so with m like h^3 it is like h^2.",
-            square,
+            is_near(by_size, 2.0, LOOSE),
             f"from h = 1/{sizes[0].cells} to 1/{sizes[-1].cells} m at one density it is like h^{by_size:.2f}.",
-            ""
-            if square
-            else "The report puts E in the place of the force on a vertex, with a constant between them. That "
-            "constant is an area, like h^2; with it the same lines give dt < c (m / (h E))^1/2, which is h (density / E)^1/2.",
+            "The report puts E in the place of the force on a vertex, with a constant between them. That constant is an area, "
+            "like h^2; with it the same lines give dt < c (m / (h E))^1/2, which is h (density / E)^1/2.",
         ),
         Claim(
             "beyond the bound semi-implicit steps are unstable.",
             not any(r.stable for r in beyond),
-            f"at {', '.join(f'{r.factor:g}' for r in beyond if r.young == beyond[0].young)} times the limit "
-            f"{sum(not r.stable for r in beyond)} of {len(beyond)} runs exceed {BOUNDED:g} times the initial stretch or "
-            f"fail; below it {sum(r.stable for r in explicit if r.factor < 1.0)} of "
-            f"{sum(r.factor < 1.0 for r in explicit)} stay.",
+            f"at {listed(beyond)} times the limit {sum(not r.stable for r in beyond)} of {len(beyond)} runs exceed {BOUNDED:g} "
+            f"times the initial stretch or fail; below it {sum(r.stable for r in below)} of {len(below)} stay.",
         ),
-        Claim("implicit steps may be larger.", all(good), _implicit_text(implicit, good)),
+        Claim(
+            "implicit steps may be larger.",
+            all(good),
+            f"implicit Euler at {listed(implicit)} times that limit stays within {BOUNDED:g} times the initial stretch and ends "
+            f"ok in {sum(good)} of {len(good)} runs; the largest reach is {max(r.reach for r in implicit):.3g} times.",
+        ),
     ]
 
 
-def _implicit_text(implicit: list[LongRun], good: list[bool]) -> str:
-    """Reach of the implicit runs, and those that failed or were not bounded."""
-    factors = ", ".join(f"{f:g}" for f in dict.fromkeys(r.factor for r in implicit))
-    bad = [f"E = {r.young:.0e} Pa at {r.factor:g}: reach {r.reach:.3g}, {r.status}" for r, ok in zip(implicit, good) if not ok]
-    text = (
-        f"implicit Euler at {factors} times that limit stays within {BOUNDED:g} times the initial stretch and ends "
-        f"ok in {sum(good)} of {len(good)} runs; the largest reach is {max(r.reach for r in implicit):.3g} times"
-    )
-    return f"{text}. {'; '.join(bad)}." if bad else f"{text}. No limit was found."
+def listed(runs: list[LongRun]) -> str:
+    """The factors of runs."""
+    return ", ".join(f"{factor:g}" for factor in dict.fromkeys(r.factor for r in runs))
 
 
 def limit_table(limits: list[Limit]) -> str:
@@ -220,47 +202,38 @@ def run_table(runs: list[LongRun]) -> str:
 
 
 def draw(youngs: list[Limit], sizes: list[Limit], runs: list[LongRun]) -> bytes:
-    """Plot the limit over E and h, and the reach of runs."""
-    figure, ((over_young, over_size, reach),) = new_figure(3)
-    over_young.plot([x.young for x in youngs], [1e3 * x.measured for x in youngs], "o", color=COLOURS[0], label="by runs")
-    over_young.plot([x.young for x in youngs], [1e3 * x.stable_dt for x in youngs], "-", color=COLOURS[1], label="stable_dt")
-    over_young.set(title="largest stable step over E", xlabel="E [Pa]", ylabel="ms", xscale="log", yscale="log")
+    """The limit over E and h, and the reach of runs."""
+    by_young = Panel("largest stable step [ms] over E", "E [Pa]", log="xy")
+    by_young.curve([x.young for x in youngs], [1e3 * x.measured for x in youngs], "by runs", 0, "o")
+    by_young.curve([x.young for x in youngs], [1e3 * x.stable_dt for x in youngs], "stable_dt", 1, "-")
+    by_size = Panel("over the size of the tets", "h [m]", log="xy")
     h, dt = np.array([1.0 / x.cells for x in sizes]), np.array([1e3 * x.measured for x in sizes])
-    over_size.plot(h, dt, "o", color=COLOURS[0], label="by runs")
-    over_size.plot(h, dt[0] * h / h[0], "-", color=COLOURS[2], label="like h")
-    over_size.plot(h, dt[0] * (h / h[0]) ** 2, ":", color=COLOURS[6], label="like h^2, the report's")
-    over_size.set(title="over the size of the tets", xlabel="h [m]", xscale="log", yscale="log")
+    by_size.curve(h, dt, "by runs", 0, "o")
+    by_size.curve(h, dt[0] * h / h[0], "like h", 2, "-")
+    by_size.curve(h, dt[0] * (h / h[0]) ** 2, "like h^2, the report's", 6, ":")
     young = youngs[len(youngs) // 2].young
-    for integrator, colour, marker in ((EXPLICIT, COLOURS[1], "o"), (IMPLICIT, COLOURS[0], "s")):
+    reach = Panel(f"reach / stretch, E = {young:.0e} Pa (cut at {FAR:g})", "dt / limit", log="xy")
+    for colour, integrator in enumerate(FACTORS, 3):
         own = [r for r in runs if r.integrator == integrator and r.young == young]
-        reach.plot([r.factor for r in own], [min(r.reach, FAR) for r in own], f"{marker}-", ms=4, color=colour, label=integrator)
-    reach.axvline(1.0, color="#555555", lw=0.9, ls="--")
-    reach.set(title=f"reach / stretch, E = {young:.0e} Pa (cut at {FAR:g})", xlabel="dt / limit", xscale="log", yscale="log")
-    for panel in (over_young, over_size, reach):
-        panel.legend(fontsize="small", frameon=False)
-    return plot_png(figure)
+        reach.curve([r.factor for r in own], [min(r.reach, FAR) for r in own], integrator, colour)
+    reach.level("x", 1.0)
+    return plot_png(by_young, by_size, reach)
 
 
 def measure(extent: Extent) -> Part:
     """Limits over E, h and density, then long runs at multiples of them."""
-    k = int(extent.quick)
-    youngs, sizes, densities, runs = [], [], [], []
-    for cells in CELLS[k]:
-        with Cube(cells, EXPLICIT, extent.arch) as cube:
-            sizes.append(cube.limit())
-            if cells != MESH:
-                continue
-            for density in DENSITIES:
-                cube.set(density=density)
-                densities.append(cube.limit())
-            for young in YOUNGS[k]:
-                cube.set(young=young)
-                youngs.append(cube.limit())
-                runs += [cube.long_run(factor, youngs[-1].measured) for factor in AROUND]
-    with Cube(MESH, IMPLICIT, extent.arch) as cube:
-        for limit in youngs:
-            cube.set(young=limit.young)
-            runs += [cube.long_run(factor, limit.measured) for factor in FACTORS]
+    quick = extent.quick
+    with without_warnings():  # of steps that are unstable
+        sizes, runs = [], []
+        for cells in CELLS[quick]:
+            with open_cube(cells, EXPLICIT, extent.arch) as sim:
+                sizes.append(find_limit(sim, cells))
+        with open_cube(MESH, EXPLICIT, extent.arch) as sim:
+            densities = [find_limit(sim, MESH, density=density) for density in DENSITIES]
+            youngs = [find_limit(sim, MESH, young=young) for young in YOUNGS[quick]]
+            runs += [run for limit in youngs for run in long_runs(sim, limit)]
+        with open_cube(MESH, IMPLICIT, extent.arch) as sim:
+            runs += [run for limit in youngs for run in long_runs(sim, limit)]
     return Part(
         "bound",
         "The largest stable step",

@@ -1,25 +1,29 @@
-"""Result of an experiment of `report.py`: claims with verdicts, tables, pictures, and their Markdown.
+"""Result of an experiment of `report.py`: claims with verdicts, tables, pictures, and their Markdown; numbers to judge.
 
 A claim is a statement of the report with our numbers; the experiment computes whether it holds. The verdict of a part is "agree"
 if all its claims hold, "disagree" if none does, else "partly".
 """
 
 import io
+import json
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
+from functools import cache
+from importlib import import_module
+from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 
 from taisoft.machine import Timing
-from taisoft.output.tables import require_matplotlib, ticks
 
-from ..document import plain, table
+from ..charts import Panel, figure_of
+from ..document import default_out, earlier_numbers, plain, table
 
 AGREE, PARTLY, DISAGREE, MISSING = "agree", "partly", "disagree", "not measured"
-COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#555555")
 PALETTE = 128  # colours of a picture, enough to avoid bands in shaded scenes
-PANEL, DPI = (4.4, 3.1), 85  # panel size in inches
+DPI = 85
 
 
 @dataclass(frozen=True)
@@ -36,7 +40,7 @@ class Extent:
 
 @dataclass(frozen=True)
 class Claim:
-    """said: the report's statement in our words; found: our numbers in a sentence; why: explanation of the verdict."""
+    """said: the report's statement in our words; found: our numbers in a sentence; why: explanation if it does not hold."""
 
     said: str
     holds: bool
@@ -86,6 +90,25 @@ def verdict_of(holds: Sequence[bool]) -> str:
 # --- numbers ----------------------------------------------------------------------------------------------------------
 
 
+@cache
+def numbers_of(name: str, quick: bool, arch: str) -> dict:
+    """Numbers of `taisoft bench NAME`: of a whole run on this machine those in benchmarks/results, else of a run now."""
+    stored = default_out(arch, name)
+    known = None if quick else earlier_numbers(stored)
+    if known is not None and not known.get("quick"):
+        return known
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / f"{name}.json" if quick else stored
+        words = ["--arch", arch, "--out", str(path), *(["--quick"] if quick else [])]
+        import_module(f"..{name}", __package__).main(words)
+        return json.loads(path.read_text())
+
+
+def restored(kind: type, record: dict):
+    """A dataclass from its record as plain data, which may hold more."""
+    return kind(**{field.name: record[field.name] for field in fields(kind) if field.name in record})
+
+
 def is_near(value: float, expected: float, tolerance: float) -> bool:
     """Whether |value - expected| <= tolerance; False for nan."""
     return math.isfinite(value) and abs(value - expected) <= tolerance
@@ -109,27 +132,11 @@ def small_png(image: np.ndarray) -> bytes:
     return out.getvalue()
 
 
-def new_figure(columns: int, lines: int = 1):
-    """A figure and its panels (lines, columns), each with a light grid."""
-    require_matplotlib("the page's plots")
+def plot_png(*panels: Panel) -> bytes:
+    """Panels side by side as a small PNG."""
     from matplotlib import pyplot
 
-    size = PANEL[0] * columns, PANEL[1] * lines
-    figure, grid = pyplot.subplots(lines, columns, figsize=size, dpi=DPI, layout="constrained", squeeze=False)
-    for panel in grid.flat:
-        panel.grid(True, which="major", color="#eeeeee")
-        panel.set_axisbelow(True)
-    return figure, grid
-
-
-def plot_png(figure) -> bytes:
-    """Close a figure and return it as a small PNG with plain numbers on logarithmic axes."""
-    from matplotlib import pyplot
-
-    for panel in figure.axes:
-        for axis, (low, high) in ((panel.xaxis, panel.get_xlim()), (panel.yaxis, panel.get_ylim())):
-            if axis.get_scale() == "log":
-                ticks(axis, high / low)
+    figure = figure_of(panels, columns=len(panels), dpi=DPI)
     figure.canvas.draw()
     image = np.asarray(figure.canvas.buffer_rgba())[..., :3].copy()
     pyplot.close(figure)
@@ -152,7 +159,8 @@ def part_text(part: Part) -> str:
 
 def claim_text(claim: Claim) -> str:
     """A bullet with claim, verdict, numbers and explanation."""
-    return f"* The report: {claim.said} **{'Agree' if claim.holds else 'Disagree'}**: {claim.found} {claim.why}".rstrip()
+    verdict, why = ("Agree", "") if claim.holds else ("Disagree", claim.why)
+    return f"* The report: {claim.said} **{verdict}**: {claim.found} {why}".rstrip()
 
 
 def summary_table(parts: Sequence[Part]) -> str:

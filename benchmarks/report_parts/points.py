@@ -1,30 +1,29 @@
 """Figures 11 and 12 of the report: time of contact points per frame and over tets; all threads, one thread, interpreted.
 
-The single thread is a child process pinned to one core. The interpreted loop is the report's first program, in Python, pair by
-pair: each of two triangles with overlapping boxes is mapped to the material space of the other's tet by barycentric coordinates,
-and Frank-Wolfe with steps 2 / (i + 2) finds its deepest point in the signed distance at rest (report, section 2.3.2). Weakness,
-as there: tets far from the triangle map it as well, so most points are found many times. Pairs and distances are those of a
-`Rig`, so that both do the same work.
+The interpreted loop is the report's first program, in Python, pair by pair: each of two triangles with overlapping boxes is
+mapped to the material space of the other's tet by barycentric coordinates, and Frank-Wolfe with steps 2 / (i + 2) finds its
+deepest point in the signed distance at rest (report, section 2.3.2). Weakness, as there: tets far from the triangle map it as
+well, so most points are found many times. Pairs and distances are those of a `Rig`, so that both do the same work.
 """
 
-import os
 from contextlib import closing
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 
 import numpy as np
 
-from taisoft.backend.runtime import open_runtime, threads
+from taisoft.backend.runtime import Runtime, open_runtime, threads
 from taisoft.collision.colliders import body_grid
 from taisoft.collision.surface import SERIAL_BELOW
-from taisoft.errors import SimulationError
-from taisoft.machine import summarise, usable_cores
+from taisoft.machine import summarise
 from taisoft.mesh.sdf import SdfGrid
 
+from ..charts import Panel
 from ..collision_cases import Setup, cubes_setup, pile_setup
-from ..collision_runs import Rig
+from ..collision_rig import Rig, on_one_thread
 from ..document import exponent, ms, table, timed_cells
-from ..runner import clock, parse_result, print_result, repeated, run_python
-from .page import COLOURS, Claim, Extent, Part, clearly_less, new_figure, plot_png
+from ..kinds import POINTS, watching
+from ..runner import clock, repeated
+from .page import Claim, Extent, Part, plot_png
 
 FRANK_WOLFE_STEPS, CLOSED = 32, 1e-4  # maximum; duality gap over the triangle's size at which it stops
 CONTACT_MODE = "distance_field"  # as in the report
@@ -87,18 +86,18 @@ class PlainPoints:
         self._behind = np.concatenate([b.nodes.boundary_tets + n for b, n in zip(bodies, starts)])
         self._rest = np.concatenate([b.nodes.positions for b in bodies])
 
-    def find(self, pairs: np.ndarray) -> list[tuple[int, int, np.ndarray, float]]:
-        """(triangle, other triangle, weights (3,), signed distance [m]) of all deepest points within the margin."""
+    def find(self, pairs: np.ndarray) -> list[float]:
+        """Signed distances [m] of all deepest points within the margin."""
         x, margin, found = self._rig.model.state.x.to_numpy(), self._rig.detection.margin, []
-        surface = x[self._rig.detection.topology.node]
+        corners = x[self._rig.detection.topology.node]
         for pair in pairs:
             for t, u in (pair, pair[::-1]):
                 tet = self._behind[u]
                 world = np.vstack([x[tet].T, np.ones(4)])  # of barycentric coordinates: corners, and their sum
-                weights = np.linalg.solve(world, np.vstack([surface[self._triangle[t]].T, np.ones(3)]))
-                w, phi = deepest_point(self._grids[self._body[u]], weights.T @ self._rest[tet])
+                weights = np.linalg.solve(world, np.vstack([corners[self._triangle[t]].T, np.ones(3)]))
+                _, phi = deepest_point(self._grids[self._body[u]], weights.T @ self._rest[tet])
                 if phi <= margin:
-                    found.append((int(t), int(u), w, phi))
+                    found.append(phi)
         return found
 
 
@@ -108,7 +107,7 @@ class PlainPoints:
 @dataclass
 class Points:
     """Contact points of a configuration; lists are wall seconds per round. first: first whole search with compilation; plain:
-    interpreted loop, empty if left out; deepest, plain_deepest: signed distance [m]."""
+    interpreted loop, empty if left out; deepest, plain_deepest: signed distance [m]; frames, plain_frames: of a film, if any."""
 
     setup: str
     tets: int
@@ -116,19 +115,11 @@ class Points:
     pairs: int
     first: float
     seconds: list[float]
+    deepest: float
     plain: list[float] = field(default_factory=list)
-    deepest: float = 0.0
     plain_deepest: float = 0.0
-
-
-@dataclass
-class Measured:
-    """Results for a number of threads, or the GPU. frames, plain_frames: seconds per frame and round of the film."""
-
-    where: str
-    frames: list[list[float]]
-    sizes: list[Points]
-    plain_frames: list[list[float]] = field(default_factory=list)
+    frames: list[list[float]] = field(default_factory=list)
+    plain_frames: list[float] = field(default_factory=list)
 
 
 def setup_of(name: str) -> Setup:
@@ -137,189 +128,149 @@ def setup_of(name: str) -> Setup:
     return {"cubes": cubes_setup, "pile": pile_setup}[kind](int(cells))
 
 
-def contact_seconds(rig: Rig, rounds: int) -> list[float]:
+def point_seconds(rig: Rig, rounds: int) -> list[float]:
     """Seconds of the contact points of a search per round, after warm-up."""
-    return [rig.phases()["contacts"] for _ in range(rounds)]
+    with watching() as spend:
+        return [spend(rig.search).seconds[POINTS] for _ in range(rounds)]
 
 
-def measure_size(rig: Rig, rounds: int, plain: PlainPoints | None) -> Points:
-    """Measure a configuration in the middle of its motion, with the rig's first search."""
-    rig.place(0.5)
-    begin = clock()
-    rig.search()
-    first = clock() - begin
-    rig.search()
-    pairs = candidate_pairs(rig)
-    found = Points(rig.setup.name, rig.tets, rig.detection.surface.n_triangles, len(pairs), first, contact_seconds(rig, rounds))
-    found.deepest = float(rig.detection.contacts().gap.min())
-    if plain is not None and len(pairs) <= MAX_INTERPRETED:
-        contacts: list = []
-        found.plain = repeated(lambda: contacts.extend(plain.find(pairs)), PLAIN_ROUNDS)
-        found.plain_deepest = min(depth for *_, depth in contacts)
-    return found
-
-
-def measure_film(rig: Rig, frames: int, rounds: int, plain: PlainPoints | None) -> tuple[list[list[float]], list[list[float]]]:
-    """Seconds of the contact points per frame and round, and of one round of the interpreted loop."""
-    compiled, interpreted = [], []
-    for k in range(frames):
-        rig.place(k / max(frames - 1, 1))
+def measure_size(name: str, runtime: Runtime, quick: bool, plain: bool) -> Points:
+    """Measure a configuration in the middle of its motion, and the frames of the film. plain: whether interpreted, too."""
+    with Rig(setup_of(name), CONTACT_MODE, runtime) as rig:
+        loop, rounds = PlainPoints(rig) if plain else None, ROUNDS[quick]
+        rig.place(0.5)
+        begin = clock()
         rig.search()
-        compiled.append(contact_seconds(rig, rounds))
-        if plain is not None:
-            pairs = candidate_pairs(rig)
-            interpreted.append(repeated(lambda pairs=pairs: plain.find(pairs), 1))
-    return compiled, interpreted
-
-
-def measure_here(quick: bool, arch: str, plain: bool) -> Measured:
-    """Measure everything in this process, on its threads."""
-    k = int(quick)
-    with closing(open_runtime(arch, "f32", "the report's contact points")) as runtime:
-        n = threads()
-        found = Measured("GPU" if arch == "cuda" else f"{n} thread{'s' * (n > 1)}", [], [])
-        for name in SIZES[k]:
-            with Rig(setup_of(name), CONTACT_MODE, runtime) as rig:
-                loop = PlainPoints(rig) if plain else None
-                found.sizes.append(measure_size(rig, ROUNDS[k], loop))
-                if name == FILM[k]:
-                    found.frames, found.plain_frames = measure_film(rig, FRAMES[k], ROUNDS[k], loop)
+        first = clock() - begin
+        pairs, seconds = candidate_pairs(rig), point_seconds(rig, rounds)
+        deepest = float(rig.detection.contacts().gap.min())
+        found = Points(name, rig.tets, rig.detection.surface.n_triangles, len(pairs), first, seconds, deepest)
+        if loop and len(pairs) <= MAX_INTERPRETED:
+            depths: list[float] = []
+            found.plain = repeated(lambda: depths.extend(loop.find(pairs)), PLAIN_ROUNDS)
+            found.plain_deepest = min(depths)
+        for k in range(FRAMES[quick] if name == FILM[quick] else 0):
+            rig.place(k / max(FRAMES[quick] - 1, 1))
+            rig.search()
+            found.frames.append(point_seconds(rig, rounds))
+            if loop:
+                pairs = candidate_pairs(rig)
+                found.plain_frames += repeated(lambda pairs=pairs: loop.find(pairs), 1)
     return found
 
 
-# --- on one thread ----------------------------------------------------------------------------------------------------
-
-CHILD = "from taisoft.cli.scene_file import load_shipped; load_shipped('benchmarks', 'report_parts.points').answer({!r})"
-
-
-def answer(quick: bool) -> None:
-    """The child: measure everything on one core."""
-    os.sched_setaffinity(0, usable_cores()[:1])
-    print_result(asdict(measure_here(quick, "cpu", plain=False)))
-
-
-def measure_on_one_thread(quick: bool) -> Measured:
-    """Measure in a child process pinned to one core. Raises SimulationError on failure."""
-    if not hasattr(os, "sched_setaffinity"):
-        raise SimulationError("this system cannot pin a process to one core, so one thread cannot be measured")
-    lines = run_python("the process on one thread", "-c", CHILD.format(quick))
-    found = parse_result(lines[-1])
-    return Measured(**found | {"sizes": [Points(**p) for p in found["sizes"]]})
+def measure_all(extent: Extent) -> tuple[str, list[Points], list[Points]]:
+    """Where it ran, and all configurations on all threads, or on the GPU, and on one thread of the processor."""
+    quick = extent.quick
+    with closing(open_runtime(extent.arch, "f32", "the report's contact points")) as runtime:
+        where = "the GPU" if extent.arch == "cuda" else f"{threads()} threads"
+        many = [measure_size(name, runtime, quick, plain=True) for name in SIZES[quick]]
+    with closing(open_runtime("cpu", "f32", "the report's contact points")) as runtime, on_one_thread():
+        return where, many, [measure_size(name, runtime, quick, plain=False) for name in SIZES[quick]]
 
 
-# --- what it says -----------------------------------------------------------------------------------------------------
+# --- what it says -------------------------------------------------------------------------------------------------------
 
 
-def claims_of(many: Measured, one: Measured) -> list[Claim]:
-    """Claims of figures 11 and 12. many: on all threads, or on the GPU."""
-    here = f"on {many.where}"
-    per_frame = [np.median(p) / np.median(c) for c, p in zip(many.frames, many.plain_frames)]
-    faster = all(clearly_less(c, p) for c, p in zip(many.frames, many.plain_frames))
-    ratios = [
-        (p, q, np.median(p.plain) / np.median(q.seconds), np.median(q.seconds) / np.median(p.seconds))
-        for p, q in zip(many.sizes, one.sizes)
-        if p.plain
-    ]
-    by_compiling, by_threads = [r[2] for r in ratios], [r[3] for r in ratios]
-    tets = [p.tets for p, *_ in ratios]
-    grown, _ = exponent(tets, [np.median(p.seconds) for p, *_ in ratios])
-    plain, _ = exponent(tets, [np.median(p.plain) for p, *_ in ratios])
-    flat = grown < FLAT
-    span = f"from {tets[0]:,} to {tets[-1]:,} tets"
-    steady = float(np.median([s for p in many.sizes for s in p.seconds]))
-    slow = all(p.first > 10 * np.median(p.seconds) for p in many.sizes)
+def claims_of(where: str, many: list[Points], one: list[Points]) -> list[Claim]:
+    """Claims of figures 11 and 12."""
+    film = next(p for p in many if p.frames)
+    per_frame = [p / np.median(c) for c, p in zip(film.frames, film.plain_frames)]
+    both = [(p, q) for p, q in zip(many, one) if p.plain]
+    by_compiling = [np.median(p.plain) / np.median(q.seconds) for p, q in both]
+    by_threads = [np.median(q.seconds) / np.median(p.seconds) for p, q in both]
+    tets = [p.tets for p, _ in both]
+    grown, _ = exponent(tets, [np.median(p.seconds) for p, _ in both])
+    plain, _ = exponent(tets, [np.median(p.plain) for p, _ in both])
+    first = [p.first for p in many]
     return [
         Claim(
             "in every frame the parallel computation is faster than the plain one, up to tenfold (figure 11).",
-            faster and max(per_frame) >= TENFOLD,
-            f"{here} the contact points of a frame take {min(per_frame):,.0f} to {max(per_frame):,.0f} times less than in the "
-            "interpreted loop over the same pairs.",
+            min(per_frame) > 1.0 and max(per_frame) >= TENFOLD,
+            f"on {where} the contact points of a frame take {min(per_frame):,.0f} to {max(per_frame):,.0f} times less than in "
+            "the interpreted loop over the same pairs.",
         ),
         Claim(
             "parallel execution causes this speed-up.",
             min(by_threads) > max(by_compiling),
             f"compiled for one thread they take {min(by_compiling):,.0f} to {max(by_compiling):,.0f} times less than "
-            f"interpreted; {here} they are {min(by_threads):.2f} to {max(by_threads):.2f} times as fast as that.",
-            ""
-            if min(by_threads) > max(by_compiling)
-            else "Compilation instead of interpretation gains most, as it would in a GPU kernel; "
-            f"below {SERIAL_BELOW:,} triangles the CPU uses one thread, since waking others takes longer.",
+            f"interpreted; on {where} they are {min(by_threads):.2f} to {max(by_threads):.2f} times as fast as that.",
+            "Compilation instead of interpretation gains most, as it would in a GPU kernel; below "
+            f"{SERIAL_BELOW:,} triangles the CPU uses one thread, since waking others takes longer.",
         ),
         Claim(
             "the parallel computation is slow at its start, and steady afterwards (figure 11).",
-            slow,
-            f"the first search takes {min(p.first for p in many.sizes):.1f} to {max(p.first for p in many.sizes):.1f} s, its "
-            f"contact points {ms(steady)} ms afterwards.",
+            all(p.first > 10 * np.median(p.seconds) for p in many),
+            f"the first search takes {min(first):.1f} to {max(first):.1f} s, its contact points "
+            f"{ms(np.median([s for p in many for s in p.seconds]))} ms afterwards.",
             "Here the start compiles kernels, there it moved data.",
         ),
         Claim(
             "its time stays near zero however many tets there are, while the plain one's grows (figure 12).",
-            flat and plain > FLAT,
-            f"{span} the time grows like tets^{grown:.2f} {here}, like tets^{plain:.2f} interpreted.",
-            ""
-            if flat
-            else "On any machine, work grows with the pairs of near triangles on touching surfaces, about tets^(2/3); it is "
-            "near zero only in comparison with the interpreted loop.",
+            grown < FLAT < plain,
+            f"over {tets[0]:,} to {tets[-1]:,} tets it grows like tets^{grown:.2f} on {where}, tets^{plain:.2f} interpreted.",
+            "On any machine, work grows with the pairs of near triangles on touching surfaces, about tets^(2/3); it is near zero "
+            "only in comparison with the interpreted loop.",
         ),
     ]
 
 
-def size_table(many: Measured, one: Measured) -> str:
+def size_table(where: str, many: list[Points], one: list[Points]) -> str:
     """A row per configuration."""
+
+    def faster(pair: tuple[Points, Points]) -> str:
+        return f"{np.median(pair[0].plain) / np.median(pair[0].seconds):,.0f}" if pair[0].plain else "-"
+
     columns = (
         ("<scene", "{[0].setup}"),
         *((name, f"{{[0].{name}:,}}") for name in ("tets", "triangles", "pairs")),
-        (f"{many.where} [ms]", lambda pair: timed_cells(pair[0].seconds)[0]),
+        (f"{where} [ms]", lambda pair: timed_cells(pair[0].seconds)[0]),
         ("spread", lambda pair: timed_cells(pair[0].seconds)[1]),
-        (f"{one.where} [ms]", lambda pair: timed_cells(pair[1].seconds)[0]),
+        ("one thread [ms]", lambda pair: timed_cells(pair[1].seconds)[0]),
         ("spread", lambda pair: timed_cells(pair[1].seconds)[1]),
-        ("interpreted [ms]", lambda pair: timed_cells(pair[0].plain)[0] if pair[0].plain else "-"),
-        ("spread", lambda pair: timed_cells(pair[0].plain)[1] if pair[0].plain else "-"),
-        ("times faster", lambda pair: f"{np.median(pair[0].plain) / np.median(pair[0].seconds):,.0f}" if pair[0].plain else "-"),
+        ("interpreted [ms]", lambda pair: ms(np.median(pair[0].plain)) if pair[0].plain else "-"),
+        ("times faster", faster),
         ("deepest [mm]", lambda pair: f"{1e3 * pair[0].deepest:.4f}"),
         ("interpreted", lambda pair: f"{1e3 * pair[0].plain_deepest:.4f}" if pair[0].plain else "-"),
     )
-    return table(zip(many.sizes, one.sizes), columns)
+    return table(zip(many, one), columns)
 
 
-def draw(many: Measured, one: Measured) -> bytes:
+def draw(where: str, many: list[Points], one: list[Points]) -> bytes:
     """Figure 11 on the left, 12 on the right."""
-    figure, ((frames, sizes),) = new_figure(2)
-    for k, (m, line) in enumerate(((many, "-"), (one, "--"))):
-        frames.plot([1e3 * np.median(f) for f in m.frames], line, color=COLOURS[k], label=m.where)
-        for kind, marker in (("cubes", "o"), ("pile", "s")):
-            own = [p for p in m.sizes if p.setup.startswith(kind)]
-            times = [1e3 * np.median(p.seconds) for p in own]
-            sizes.plot([p.tets for p in own], times, f"{marker}{line}", ms=4, color=COLOURS[k])
-    frames.plot([1e3 * np.median(f) for f in many.plain_frames], color=COLOURS[2], label="interpreted")
-    plain = [p for p in many.sizes if p.plain]
-    sizes.plot([p.tets for p in plain], [1e3 * np.median(p.plain) for p in plain], "o-", ms=4, color=COLOURS[2])
-    frames.set(title="contact points of each frame", xlabel="frame", ylabel="ms", yscale="log")
-    frames.legend(fontsize="small", frameon=False)
-    sizes.set(title="over tets; squares: the pile", xlabel="tets", ylabel="ms", xscale="log", yscale="log")
-    return plot_png(figure)
+    frames = Panel("contact points of each frame", "frame", "ms", log="y")
+    sizes = Panel("over tets; squares: the pile", "tets", "ms", log="xy")
+    for k, (label, found) in enumerate(((where, many), ("one thread", one))):
+        for p in found:
+            if p.frames:
+                frames.curve(range(len(p.frames)), [1e3 * np.median(f) for f in p.frames], label, k, "-")
+        for kind, line in (("cubes", "o-"), ("pile", "s-")):
+            own = [p for p in found if p.setup.startswith(kind)]
+            sizes.curve([p.tets for p in own], [1e3 * np.median(p.seconds) for p in own], label, k, line)
+    film, plain = next(p for p in many if p.frames), [p for p in many if p.plain]
+    frames.curve(range(len(film.frames)), [1e3 * s for s in film.plain_frames], "interpreted", 2, "-")
+    sizes.curve([p.tets for p in plain], [1e3 * np.median(p.plain) for p in plain], "interpreted", 2)
+    return plot_png(frames, sizes)
 
 
 def measure(extent: Extent) -> Part:
-    """Measure in this process and in a child on one thread."""
-    many = measure_here(extent.quick, extent.arch, plain=True)
-    one = measure_on_one_thread(extent.quick)
+    """Contact points on all threads, on one, and interpreted."""
+    where, many, one = measure_all(extent)
     part = Part(
         "points",
         "Contact points, parallel and not",
         "section 3.1.2, figures 11 and 12",
-        "contact points alone of searches through distance fields (Frank-Wolfe), bodies as in `taisoft bench collision`, in "
-        "f32: compiled on all threads, compiled on one (a process that has one core), and an interpreted NumPy loop over the "
-        f"same pairs, which is not run on more than {MAX_INTERPRETED:,}. Equal deepest points show that both do the same.",
-        claims_of(many, one),
-        [size_table(many, one)],
-        {"points.png": draw(many, one)},
+        "contact points alone of searches through distance fields (Frank-Wolfe), bodies as in `taisoft bench collision`, in f32: "
+        "compiled for all threads, compiled for one, and an interpreted NumPy loop over the same pairs, where these are at most "
+        f"{MAX_INTERPRETED:,}. Equal deepest points show that both do the same.",
+        claims_of(where, many, one),
+        [size_table(where, many, one)],
+        {"points.png": draw(where, many, one)},
     )
     if extent.arch == "cpu":
-        part.short.append(f"the report has a GPU, this run {many.where} of a processor; `--arch cuda` runs it on a GPU.")
-    if left := [p.setup for p in many.sizes if not p.plain]:
+        part.short.append(f"the report has a GPU, this run {where} of a processor; `--arch cuda` runs it on a GPU.")
+    if left := [p.setup for p in many if not p.plain]:
         part.short.append(f"the interpreted loop was left out for {', '.join(left)}, so the ratios end below.")
-    part.times = {f"{p.setup}, all threads": summarise(p.seconds) for p in many.sizes}
-    part.times |= {f"{p.setup}, one thread": summarise(p.seconds) for p in one.sizes}
-    part.times |= {f"{p.setup}, interpreted": summarise(p.plain) for p in many.sizes if p.plain}
+    part.times = {f"{p.setup}, {where}": summarise(p.seconds) for p in many}
+    part.times |= {f"{p.setup}, one thread": summarise(p.seconds) for p in one}
     return part

@@ -1,5 +1,6 @@
 """What takes the place of measurements and simulators in tests of benchmarks."""
 
+import json
 from collections.abc import Callable
 from dataclasses import asdict
 from types import SimpleNamespace
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 
 from benchmarks import ipc_runs, suite
+from benchmarks.document import plain
 from taisoft.dynamics.schemes import EXPLICIT
 from taisoft.nested import from_json, to_json
 from taisoft.records import StepReport
@@ -77,6 +79,11 @@ def answer_here(patch: pytest.MonkeyPatch, answer: Callable[[dict], dict]) -> No
 def ipc_answer(request: dict) -> dict:
     """What a child of `taisoft bench ipc` answers."""
     return asdict(ipc_record(ipc_runs.Job(**{key: value for key, value in request.items() if key != suite.UNFINISHED})))
+
+
+def in_this_process(_what: str, function: Callable, *arguments, **_):
+    """Instead of `in_child`: what JSON leaves of the function's result."""
+    return json.loads(json.dumps(plain(function(*arguments))))
 
 
 def ipc_record(job=None, **more) -> ipc_runs.Record:

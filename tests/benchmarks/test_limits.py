@@ -11,7 +11,7 @@ import pytest
 import taisoft as ts
 from benchmarks import error, error_quantities, scaling
 from benchmarks.document import Limit
-from benchmarks.elasticity_steps import Cost, Frames, cost_limits, cost_table, frame_limits
+from benchmarks.elasticity import Cost, cost_limits, cost_table
 from benchmarks.error_cases import CONTACT, SMOOTH
 from benchmarks.scaling_bytes import GROUPS, Copy, copy_rate, floor_bytes, group_bytes
 from benchmarks.scaling_runs import Row as Work
@@ -39,8 +39,8 @@ def test_costs_are_compared_sample_by_sample():
     large = [Cost(34_560, "SNH", "velocity_verlet", precision, 0.5, [345.6e-6]) for precision in ("f32", "f64")]
     (limit,) = cost_limits(large)  # in single precision only
     assert (limit.value, limit.limit) == pytest.approx((10, 11)) and "ns/tet" in limit.what
-    rows = [Frames(540, "velocity_verlet", 84, [11e-6, 22e-6, 5.5e-6], [10e-6, 20e-6, 5e-6])]
-    (limit,) = frame_limits([*rows, Frames(540, "implicit_euler", 1, [2e-3], [1e-3])])
+    run = Cost(4320, "SNH", "velocity_verlet", "f32", 0.5, [10e-6, 20e-6, 5e-6], [11e-6, 22e-6, 5.5e-6])
+    (limit,) = cost_limits([run, Cost(4320, "SNH", "implicit_euler", "f32", 0.5, [1e-3], [2e-3])])
     assert limit.value == pytest.approx(1.1) and limit.spread == pytest.approx(0) and not limit.met
 
 
