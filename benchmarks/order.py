@@ -1,48 +1,109 @@
-"""First- and second-order tets: error against time over refinements, in statics and in one motion.
+"""First- and second-order tets: error against time over refinements, in statics.
 
 taisoft bench order [--quick] [--case NAME] [--arch cpu|cuda] [--out FILE.json] [--plot FILE.png]
 
 Computed in f64. Every case is solved on several meshes with linear tets (order 1) and quadratic tets (order 2, four quadrature
-points; some with fourteen). A time is the median over rounds of the whole solution from the rest shape with compiled kernels; the
-first launches are timed separately, as "compile". Spread is the interquartile range over the median. Errors are relative, the
-largest of the measured numbers; "< " marks errors below the reference's uncertainty. The time to 1 % error is interpolated
-between two meshes in the logarithms; if all meshes lie on one side of 1 % it is a bound, marked > or <=. Exit status: 0, or 1 if
-a limit is not met. --quick has only the hanging beam, unless another case is named, two meshes per order and no limits. A full
-run takes about ten minutes on two cores.
+points; some with fourteen). A time is the median of whole solutions from the rest shape with compiled kernels; long ones are
+not repeated. Spread is the interquartile range over the median. Errors are relative, the largest of the measured numbers; "< "
+marks errors below the reference's uncertainty. The time to 1 % error is interpolated between two meshes in the logarithms; if
+all meshes lie on one side of 1 % it is a bound, marked > or <=. Exit status: 0, or 1 if a limit is not met. --quick has only
+the hanging beam, unless another case is named, two meshes per order and no limits. A full run takes about ten minutes on two
+cores. `taisoft study SCENE --order 1,2 --refine 0,1,2` measures the motion of any scene so.
 """
 
 import math
 import sys
 from collections.abc import Sequence
-from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
-from taisoft.backend.runtime import open_runtime
-from taisoft.errors import OutputError
+import numpy as np
+
+import taisoft as ts
+from taisoft.errors import OutputError, SimulationError, TaisoftError
 from taisoft.machine import Timing, summarise
-from taisoft.output.tables import percent, require_matplotlib, save, spread_of, ticks
+from taisoft.output.tables import percent, spread_of
 
+from .charts import Panel, write_plot
 from .document import Document, Limit, begin, table
-from .order_cases import CASES, HANGING, LINEAR, QUADRATIC, Case, Reference
-from .order_runs import Row, measure_case
+from .order_cases import CASES, HANGING, LINEAR, POINTS, QUADRATIC, Case, Element
 from .reference_cases.record import label
-from .runner import make_parser, parse_options
+from .runner import make_parser, parse_options, progress, repeated, timed, without_warnings
 
-ROUNDS, QUICK_ROUNDS, QUICK_MESHES = 5, 1, 2
-GOALS = (0.1, 0.03, 0.01)  # errors whose times are compared
-GOAL = GOALS[-1]  # the error of the summary
+ROUNDS, ROUND_SECONDS, MIN_ROUNDS = 15, 1.0, 3  # a solution is repeated this often, or until its runs have taken this long
+QUICK_ROUNDS, QUICK_MESHES = 1, 2
+ENOUGH_SECONDS = 4.0  # a solution that takes longer is not repeated
+TOLERANCE = 1e-6  # of |residual| / |load|
+GOAL = 0.01  # error whose times are compared
 MIN_SPEEDUP = 20.0  # time of the hanging beam to that error, order 1 over order 2
 ELASTICA_LIMIT = 0.005  # error of order 2 on its finest mesh
 LEAST_ERROR = 1e-12  # replaces zero errors in logarithms
-DEFAULT_DEGREE = {1: None, 2: 2}  # quadrature of the compared elements
-STYLES = {  # (order, degree) -> label, colour, marker, line
-    (1, None): ("order 1", "#d55e00", "o", "-"),
-    (2, 2): ("order 2, 4 points", "#0072b2", "s", "-"),
-    (2, 4): ("order 2, 14 points", "#009e73", "^", ":"),
-}
-COLUMNS, PANEL = 3, (4.2, 3.2)  # panels in a row, their size in inches
 SURE = 1e-5  # the lowest error drawn, for exact references
+COMPARED = {1: LINEAR, 2: QUADRATIC}
+DEFAULT_DEGREE = dict(COMPARED.values())  # quadrature of the compared elements
+STYLES = {"order 1": (LINEAR, "o-"), "order 2, 4 points": (QUADRATIC, "s-"), "order 2, 14 points": ((2, 4), "^:")}
+
+
+# --- runs ---------------------------------------------------------------------------------------------------------------
+
+
+@dataclass
+class Row:
+    """One element on one mesh. rounds: wall seconds per solution; error: largest relative error of the measured numbers."""
+
+    case: str
+    law: str
+    order: int
+    degree: int | None
+    cells: tuple
+    tets: int = 0
+    nodes: int = 0
+    measured: list[float] = field(default_factory=list)
+    error: float | None = None
+    newton: int = 0
+    linear: int = 0
+    rounds: list[float] = field(default_factory=list)
+    compile_seconds: float = 0.0
+    field_bytes: int = 0
+    failure: str = ""
+
+    @property
+    def element(self) -> Element:
+        """Order and degree."""
+        return self.order, self.degree
+
+    @property
+    def timing(self) -> Timing | None:
+        """Of a solution [s]; None where it was never timed."""
+        return summarise(self.rounds) if self.rounds else None
+
+    def record(self) -> dict:
+        """As plain data."""
+        return asdict(self) | {"seconds": self.timing and asdict(self.timing)}
+
+
+def measure_mesh(case: Case, element: Element, cells: tuple, quick: bool, arch: str) -> Row:
+    """Solve a case on a mesh, and time its solution; the row records a failure."""
+    progress(f"{case.name}: order {element[0]}, {POINTS[element]} points, {label(cells)}")
+    row = Row(case.name, case.law, *element, tuple(cells))
+    try:
+        with without_warnings():  # order 1 bends too little on coarse meshes, which is measured here
+            scene = case.build(cells, element)
+        body, settings = scene.bodies[0], {"newton_tolerance": TOLERANCE, "precision": "f64", "arch": arch}
+        row.tets, row.nodes = body.mesh.n_tets, len(body.rest_positions)
+        with ts.Simulator(scene, dt=1.0, integrator="static", **settings) as sim:
+            report, seconds = timed(sim.step)
+            row.newton, row.linear = report.newton_iterations, report.linear_iterations
+            row.field_bytes, row.compile_seconds = sum(sim.field_bytes.values()), sim.compile_seconds
+            if not report.converged or report.n_inverted:
+                raise SimulationError(f"not converged: the residual is {report.residual:.1e} of the load")
+            row.measured = case.read(body, sim).tolist()
+            row.error = float(np.abs(np.array(row.measured) / np.array(case.reference.values) - 1.0).max())
+            rounds = (QUICK_ROUNDS, ROUND_SECONDS, 1) if quick else (ROUNDS, ROUND_SECONDS, MIN_ROUNDS)
+            row.rounds = [seconds] if seconds > ENOUGH_SECONDS else repeated(lambda: (sim.reset(), sim.step()), *rounds)
+    except TaisoftError as error:
+        row.failure = str(error)
+    return row
 
 
 # --- times to an error --------------------------------------------------------------------------------------------------
@@ -61,21 +122,22 @@ class Reach:
 
 @dataclass(frozen=True)
 class Comparison:
-    """Times of both orders to an error in one case. ratio: order 1 over order 2, of every round; bound: "=", ">", "<" or "?"."""
+    """Times of both orders to an error in one case; None where they are unknown."""
 
     case: str
     law: str
     goal: float
     reach: dict[int, Reach | None]
-    ratio: Timing | None
-    bound: str
 
-    def texts(self) -> tuple[str, str, str, str]:
-        """Both times, the ratio and its spread."""
-        times = (str(self.reach[order] or "-") for order in DEFAULT_DEGREE)
-        if self.ratio is None:
-            return *times, "-", ""
-        return *times, f"{'' if self.bound == '=' else self.bound + ' '}{self.ratio.median:.3g}", percent(spread_of(self.ratio))
+    @property
+    def ratio(self) -> float | None:
+        """Time of order 1 over that of order 2, where both are interpolated."""
+        slow, fast = self.reach[1], self.reach[2]
+        return slow.seconds / fast.seconds if slow and fast and slow.bound == fast.bound == "=" else None
+
+    def record(self) -> dict:
+        """As plain data."""
+        return asdict(self) | {"ratio": self.ratio and {"median": self.ratio}}
 
 
 def time_to(errors: Sequence[float], seconds: Sequence[float], goal: float) -> Reach | None:
@@ -95,59 +157,40 @@ def time_to(errors: Sequence[float], seconds: Sequence[float], goal: float) -> R
     return Reach(math.exp((1 - t) * math.log(seconds[k]) + t * math.log(seconds[k + 1])), "=")
 
 
-def claimed(row: Row, reference: Reference) -> float:
+def claimed(row: Row, case: Case) -> float:
     """The row's error, at least the reference's uncertainty."""
-    return max(row.error, reference.uncertainty)
+    return max(row.error, case.reference.uncertainty)
 
 
-def chain(rows: list[Row], order: int) -> list[Row]:
-    """The rows of an order with its default quadrature, an error and a time."""
-    return [r for r in rows if (r.order, r.degree) == (order, DEFAULT_DEGREE[order]) and r.error is not None and r.rounds]
+def timed_rows(rows: list[Row], element: Element) -> list[Row]:
+    """The rows of an element with an error and a time."""
+    return [row for row in rows if row.element == element and row.error is not None and row.rounds]
 
 
-def compare(case: Case, rows: list[Row], reference: Reference, goal: float = GOAL) -> Comparison:
-    """Times to an error, and their ratio in each complete round; unknown below the reference's uncertainty."""
-    chains = {order: chain(rows, order) for order in DEFAULT_DEGREE}
-    errors = {order: [claimed(r, reference) for r in found] for order, found in chains.items()}
-
-    def reach(order: int, seconds: list[float]) -> Reach | None:
-        return time_to(errors[order], seconds, goal) if goal > reference.uncertainty else None
-
-    times = {order: reach(order, [r.timing.median for r in found]) for order, found in chains.items()}
-    bound = _ratio_bound(times[1], times[2])
-    if bound == "?":
-        return Comparison(case.name, case.law, goal, times, None, bound)
-    ratios = []
-    for k in range(min(len(r.rounds) for found in chains.values() for r in found)):
-        slow, fast = (reach(order, [r.rounds[k] for r in found]).seconds for order, found in chains.items())
-        ratios.append(slow / fast)
-    return Comparison(case.name, case.law, goal, times, summarise(ratios), bound)
-
-
-def _ratio_bound(slow: Reach | None, fast: Reach | None) -> str:
-    """Kind of the ratio slow / fast: "=", a lower bound ">", an upper bound "<", or unknown "?"."""
-    if slow is None or fast is None:
-        return "?"
-    at_least = slow.bound in "=>" and fast.bound in ("=", "<=")
-    at_most = slow.bound in ("=", "<=") and fast.bound in "=>"
-    return {(True, True): "=", (True, False): ">", (False, True): "<", (False, False): "?"}[at_least, at_most]
+def compare(case: Case, rows: list[Row], goal: float = GOAL) -> Comparison:
+    """Times to an error; unknown below the reference's uncertainty."""
+    reach: dict[int, Reach | None] = {}
+    for order, element in COMPARED.items():
+        own = timed_rows(rows, element) if goal > case.reference.uncertainty else []
+        reach[order] = time_to([claimed(row, case) for row in own], [row.timing.median for row in own], goal)
+    return Comparison(case.name, case.law, goal, reach)
 
 
 # --- tables and limits --------------------------------------------------------------------------------------------------
 
 
-def row_table(rows: list[Row], reference: Reference) -> str:
+def row_table(rows: list[Row], case: Case) -> str:
     """A row per mesh; failures below."""
 
     def error(row: Row) -> str:
         if row.error is None:
             return "-"
-        return ("< " if row.error < reference.uncertainty else "") + f"{100 * claimed(row, reference):.3g}"
+        return ("< " if row.error < case.reference.uncertainty else "") + f"{100 * claimed(row, case):.3g}"
 
     columns = (
         ("<law", "{.law}"),
         ("order", "{.order}"),
-        ("points", "{.points}"),
+        ("points", lambda row: str(POINTS[row.element])),
         ("<cells", lambda row: label(row.cells)),
         ("tets", "{.tets:,}"),
         ("nodes", "{.nodes:,}"),
@@ -165,114 +208,56 @@ def row_table(rows: list[Row], reference: Reference) -> str:
 
 
 def compare_table(comparisons: list[Comparison]) -> str:
-    """A row per case and error."""
-    columns = [("<case", "{.case}"), ("<law", "{.law}"), ("error", "{.goal:.0%}")]
-    for k, heading in enumerate(("order 1", "order 2", "order 1 / order 2", "spread")):
-        columns.append((heading, lambda c, k=k: c.texts()[k]))
-    return table(comparisons, columns)
+    """A row per case."""
+    columns = [("<case", "{.case}"), ("<law", "{.law}")]
+    columns += [(f"order {order}", lambda c, order=order: str(c.reach[order] or "-")) for order in COMPARED]
+    return table(comparisons, [*columns, ("order 1 / order 2", lambda c: f"{c.ratio:.3g}" if c.ratio else "-")])
 
 
 def find_limits(comparisons: list[Comparison], rows: list[Row]) -> list[Limit]:
     """Limits on the ratio of the hanging beam and on the errors of order 2 against the elastica."""
     limits = []
     for c in comparisons:
-        if c.case == HANGING and c.goal == GOAL:
-            known = c.ratio is not None and c.bound in "=>"
+        if c.case == HANGING:
             what = f"{c.case}: order 1's time to {c.goal:.0%} error / order 2's"
-            value, spread = (c.ratio.median, spread_of(c.ratio)) if known else (math.nan, None)
-            limits.append(Limit(what, value, MIN_SPEEDUP, spread, at_least=True))
+            limits.append(Limit(what, c.ratio or math.nan, MIN_SPEEDUP, at_least=True))
     for name in dict.fromkeys(row.case for row in rows if row.case.startswith("elastica")):
-        own = [row for row in rows if row.case == name and (row.order, row.degree) == (2, DEFAULT_DEGREE[2])]
+        own = [row for row in rows if row.case == name and row.element == QUADRATIC]
         value = math.nan if not own or own[-1].error is None else 100 * own[-1].error
         limits.append(Limit(f"{name}: error of order 2, finest mesh [%]", value, 100 * ELASTICA_LIMIT))
     return limits
 
 
-# --- the picture --------------------------------------------------------------------------------------------------------
-
-
-def draw(cases: list[tuple[Case, list[Row], Reference]], path: Path) -> None:
+def draw(cases: list[Case], rows: list[Row], path: Path) -> None:
     """Write a PNG with a panel per case. Raises OutputError."""
-    require_matplotlib()
-    from matplotlib import pyplot
-
-    cases = [found for found in cases if any(r.error is not None and r.rounds for r in found[1])]
-    if not cases:
+    panels = []
+    for case in cases:
+        panel = Panel(f"{case.title}, {case.law}", "time of a solution [s]", "error [%]", "xy")
+        for colour, (name, (element, line)) in enumerate(STYLES.items()):
+            if own := timed_rows([row for row in rows if row.case == case.name], element):
+                errors = [100 * max(claimed(row, case), SURE) for row in own]
+                panel.curve([row.timing.median for row in own], errors, name, colour, line)
+        panel.level("y", 100 * GOAL, f"{GOAL:.0%} error")
+        if case.reference.uncertainty:
+            panel.level("y", 100 * case.reference.uncertainty, "the reference's own error", ls=":")
+        panels += [panel] if panel.curves else []
+    if not panels:
         raise OutputError(f"{path}: there is nothing to draw, since no mesh has an error")
-    columns = min(COLUMNS, len(cases))
-    lines = math.ceil(len(cases) / columns)
-    size = PANEL[0] * columns, PANEL[1] * lines + 0.5
-    figure, grid = pyplot.subplots(lines, columns, figsize=size, squeeze=False, layout="constrained")
-    for panel in grid.flat[len(cases) :]:
-        panel.set_visible(False)
-    drawn: dict = {}
-    for panel, (case, rows, reference) in zip(grid.flat, cases):
-        drawn |= _panel(panel, case, rows, reference)
-    figure.legend(drawn.values(), drawn.keys(), loc="outside upper center", ncols=min(len(drawn), 2 * columns), frameon=False)
-    figure.supxlabel("time of a solution [s], median of the rounds")
-    figure.supylabel("error [%]")
-    save(figure, path)
-
-
-def _panel(panel, case: Case, rows: list[Row], reference: Reference) -> dict:
-    """Draw one case; returns label -> handle of its lines."""
-    handles = {}
-    for (order, degree), (name, colour, marker, line) in STYLES.items():
-        own = [r for r in rows if (r.order, r.degree) == (order, degree) and r.error is not None and r.rounds]
-        if own:
-            seconds = [r.timing.median for r in own]
-            errors = [100 * max(claimed(r, reference), SURE) for r in own]
-            (handles[name],) = panel.plot(seconds, errors, line, color=colour, marker=marker, ms=5, lw=1.6)
-    handles[f"{GOAL:.0%} error"] = panel.axhline(100 * GOAL, color="#555555", lw=0.9, ls="--")
-    if reference.uncertainty > 0.0:
-        floor = 100 * reference.uncertainty
-        handles["below the reference's own error"] = panel.axhspan(floor / 1e3, floor, color="#dddddd", lw=0)
-    panel.set(xscale="log", yscale="log", title=f"{case.title}, {case.law}")
-    shown = [r for r in rows if r.error is not None and r.rounds]
-    errors = [100 * max(claimed(r, reference), SURE) for r in shown] + [100 * GOAL]
-    panel.set_ylim(min(errors) / 1.6, max(errors) * 1.6)
-    ticks(panel.yaxis, max(errors) / min(errors))
-    seconds = [r.timing.median for r in shown]
-    panel.set_xlim(min(seconds) / 1.6, max(seconds) * 1.6)
-    ticks(panel.xaxis, max(seconds) / min(seconds))
-    panel.grid(True, which="major", color="#eeeeee")
-    panel.set_axisbelow(True)
-    return handles
+    write_plot(path, panels)
 
 
 # --- the whole ----------------------------------------------------------------------------------------------------------
 
 
-def case_text(case: Case, rows: list[Row], reference: Reference) -> str:
-    """Section of a case: its reference and its rows."""
-    values = ", ".join(f"{x:.7g}" for x in reference.values) or "none"
-    good = f", uncertainty {reference.uncertainty:.2%}" if reference.uncertainty else ""
-    compared_with = f"{case.quantity}; reference: {values}{good}; {reference.source}."
-    note = f"\nNote: {case.note}." if case.note else ""
-    return f"## {case.name}: {case.title}, {case.law}\n\n{compared_with}{note}\n\n{row_table(rows, reference)}"
-
-
-def chosen_meshes(case: Case, quick: bool) -> dict:
-    """The case's meshes per element; in a quick run the first ones of the two compared elements."""
-    if not quick:
-        return case.meshes
-    return {element: case.meshes[element][:QUICK_MESHES] for element in (LINEAR, QUADRATIC)}
-
-
-def measure(cases: list[Case], quick: bool, arch: str, document: Document) -> tuple[list, list[Comparison]]:
-    """Measure and print: (case, rows, reference) of each case, and the comparisons."""
-    found, comparisons = [], []
-    with closing(open_runtime(arch, "f64", "the benchmark of orders")) as runtime:
-        for case in cases:
-            rows, reference = measure_case(case, chosen_meshes(case, quick), QUICK_ROUNDS if quick else ROUNDS, runtime)
-            found.append((case, rows, reference))
-            document.add(case_text(case, rows, reference))
-            if reference.values:
-                own = [compare(case, rows, reference, goal) for goal in GOALS]
-                document.add("Time to an error:\n\n" + compare_table(own))
-                comparisons += own
-    document.add(f"## Time to {GOAL:.0%} error\n\n" + compare_table([c for c in comparisons if c.goal == GOAL]))
-    return found, comparisons
+def measure(case: Case, quick: bool, arch: str, document: Document) -> list[Row]:
+    """Measure and print a case; in a quick run the first meshes of the two compared elements."""
+    meshes = {element: case.meshes[element][:QUICK_MESHES] for element in COMPARED.values()} if quick else case.meshes
+    rows = [measure_mesh(case, element, cells, quick, arch) for element, chain in meshes.items() for cells in chain]
+    reference = case.reference
+    values = ", ".join(f"{x:.7g}" for x in reference.values)
+    compared_with = f"{case.quantity}; reference: {values}, uncertainty {reference.uncertainty:.2%}; {reference.source}."
+    document.add(f"## {case.name}: {case.title}, {case.law}\n\n{compared_with}\n\n{row_table(rows, case)}")
+    return rows
 
 
 def main(argv=None) -> int:
@@ -284,13 +269,16 @@ def main(argv=None) -> int:
     options = parse_options(parser, argv, "error against time, a panel per case")
     name = options.case or (HANGING if options.quick else None)
     document, numbers = begin("First- and second-order tets: error against time")
-    cases = [case for case in CASES if name in (None, case.name)]
-    found, comparisons = measure(cases, options.quick, options.arch, document)
-    rows = [row for _, rows, _ in found for row in rows]
-    numbers |= {"precision": "f64", "references": {case.name: reference for case, _, reference in found}}
+    cases, rows, comparisons = [case for case in CASES if name in (None, case.name)], [], []
+    for case in cases:
+        own = measure(case, options.quick, options.arch, document)
+        rows += own
+        comparisons.append(compare(case, own))
+    document.add(f"## Time to {GOAL:.0%} error\n\n" + compare_table(comparisons))
+    numbers |= {"precision": "f64", "references": {case.name: case.reference for case in cases}}
     numbers |= {"rows": rows, "comparisons": comparisons}
     limits = [] if options.quick else find_limits(comparisons, rows)
-    return document.finish(options, numbers, limits, lambda path: draw(found, path))
+    return document.finish(options, numbers, limits, lambda path: draw(cases, rows, path))
 
 
 if __name__ == "__main__":

@@ -43,7 +43,7 @@ from benchmarks import (
 )
 from benchmarks.collision_cases import REPORT
 from benchmarks.elasticity import Cost
-from benchmarks.order_runs import Row as OrderRow
+from benchmarks.order import Row as OrderRow
 from benchmarks.scaling_bytes import measure_copy
 from taisoft.dynamics.schemes import EXPLICIT, IMPLICIT
 from taisoft.view.pictures import picture_writer
@@ -163,8 +163,8 @@ def many_check(n):
 
 
 def order_small(patch, folder):
-    row = OrderRow("hanging_beam", "SNH", 1, None, 1, (11, 2, 2), 220, 108, [-2.26758], 0.163, 5, 90, [0.5])
-    replace(patch, order, measure_case=lambda case, *_: ([row], case.reference))
+    row = OrderRow("hanging_beam", "SNH", 1, None, (11, 2, 2), 220, 108, [-2.26758], 0.163, 5, 90, [0.5])
+    replace(patch, order, measure_mesh=lambda *_: row)
 
 
 def pictures_small(patch, folder):
