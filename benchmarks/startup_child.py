@@ -1,6 +1,7 @@
 """A child process of `taisoft bench startup`; it uses public names only, so that older versions can run it.
 
-python startup_child.py TASK [NUMBER ...] prints one line of JSON. Times are seconds of this process.
+python startup_child.py TASK [NUMBER ...] prints one line of JSON: section of the page -> row -> value. Waiting is wall and CPU
+seconds.
 """
 
 import gc
@@ -16,6 +17,11 @@ import numpy as np
 import taisoft as ts
 
 RUBBER = {"law": "stable_neo_hookean", "young": 1e6, "poisson": 0.3, "density": 1000.0}
+Rows = dict[str, dict]  # section -> row -> value
+WAITING, COUNTS, CALLS, CHANGES, SPEED = "Waiting", "Counts", "Launches and accesses by the host", "Changes", "Speed"
+
+
+# --- scenes -------------------------------------------------------------------------------------------------------------
 
 
 def beam(cells: int, young: float = RUBBER["young"]) -> ts.Scene:
@@ -60,40 +66,24 @@ def triangles(cells: int) -> str:
     return f"{4 * cells * (cells + 2) + 32:,} triangles"
 
 
+IMPLICIT = {"dt": 2e-3, "integrator": "implicit_euler"}
 SCENES = {
     "beam": (beam, {"dt": 2e-4, "integrator": "symplectic_euler"}),
-    "cube": (cube, {"dt": 2e-3, "integrator": "implicit_euler"}),
-    "plane": (plane, {"dt": 2e-3, "integrator": "implicit_euler"}),
-    "sheet": (sheet, {"dt": 2e-3, "integrator": "implicit_euler"}),
+    "cube": (cube, IMPLICIT),
+    "plane": (plane, IMPLICIT),
+    "sheet": (sheet, IMPLICIT),
 }
 
 
-def timed(what: Callable) -> dict[str, float]:
-    """Wall and CPU seconds of a call."""
-    wall, cpu = time.perf_counter(), time.process_time()
-    what()
-    return {"wall": time.perf_counter() - wall, "cpu": time.process_time() - cpu}
-
-
-def compiled() -> int | None:
-    """Number of kernels compiled so far, None if the version does not count them."""
-    try:
-        from taisoft.backend.runtime import n_compiled
-    except ImportError:
-        return None
-    return n_compiled()
-
-
-def memory() -> float:
-    """Resident memory of this process [MB] after garbage collection, including pages kept for reuse."""
-    gc.collect()
-    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
+def simulator(name: str, cells: int) -> ts.Simulator:
+    """A new simulator of a scene."""
+    build, settings = SCENES[name]
+    return ts.Simulator(build(cells), **settings)
 
 
 def simulate(name: str, cells: int, steps: int = 10, hard: bool = False) -> None:
     """Build a simulator and run its first steps. hard: also compile the kernels of steps that are hard to solve."""
-    build, settings = SCENES[name]
-    with ts.Simulator(build(cells), **settings) as sim:
+    with simulator(name, cells) as sim:
         walk(sim, steps)
         if hard and hasattr(sim._dynamics.stepper, "compile_hard_steps"):
             sim._dynamics.stepper.compile_hard_steps()
@@ -106,67 +96,98 @@ def walk(sim: ts.Simulator, steps: int) -> None:
         sim.advance(last - sim.step_count)
 
 
-def first(name: str, cells: int) -> dict:
-    """Time to the tenth step."""
-    return timed(lambda: simulate(name, cells))
+# --- what is measured of a process ----------------------------------------------------------------------------------------
 
 
-def again(name: str, cells: int, larger: int) -> dict:
+def timed(what: Callable) -> tuple[float, float]:
+    """Wall and CPU seconds of a call."""
+    wall, cpu = time.perf_counter(), time.process_time()
+    what()
+    return time.perf_counter() - wall, time.process_time() - cpu
+
+
+def often(do: Callable, before: Callable = lambda: None) -> float:
+    """Median of the milliseconds of nine calls, after one that compiles. before: done each time, not timed."""
+    found = []
+    for _ in range(10):
+        before()
+        found.append(1e3 * timed(do)[0])
+    return float(np.median(found[1:]))
+
+
+def compiled() -> float:
+    """Number of kernels compiled so far, nan if the version does not count them."""
+    try:
+        from taisoft.backend.runtime import n_compiled
+    except ImportError:
+        return float("nan")
+    return n_compiled()
+
+
+def growth(do: Callable, times: int) -> float:
+    """Growth of the resident memory of this process [MB], with pages kept for reuse, over `times` calls after two."""
+
+    def resident() -> float:
+        gc.collect()
+        return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
+
+    for _ in range(2):
+        do()
+    before = resident()
+    for _ in range(times):
+        do()
+    return resident() - before
+
+
+# --- tasks --------------------------------------------------------------------------------------------------------------
+
+
+def first(name: str, cells: int) -> Rows:
+    """The tenth step; its caller measures the whole process."""
+    simulate(name, cells)
+    return {}
+
+
+def again(name: str, cells: int, larger: int) -> Rows:
     """Times to the tenth step of a first simulator, a second one like it, and one with more cells."""
-    found = {}
+    waiting, counts = {}, {}
     for label, n in (("first", cells), ("second", cells), ("other size", larger)):
         before = compiled()
-        found[label] = timed(lambda n=n: simulate(name, n))
-        found[label]["compiled"] = since(before)
-    return found
+        waiting[f"{name}, {label} in one process"] = timed(lambda n=n: simulate(name, n))
+        counts[f"{name}: kernels compiled, {label}"] = compiled() - before
+    return {WAITING: waiting, COUNTS: counts}
 
 
-def since(before: int | None) -> int | None:
-    """Kernels compiled since `compiled` returned `before`."""
-    return None if before is None else compiled() - before
-
-
-def surfaces(*sizes: int) -> dict:
+def surfaces(*sizes: int) -> Rows:
     """Kernels that sheets of ascending sizes compile, one after the other in one process."""
-    found = {}
+    counts = {}
     for cells in sizes:
         before = compiled()
-        if before is not None:
-            simulate("sheet", cells, 3, hard=True)
-        found[triangles(cells)] = since(before)
-    return found
+        simulate("sheet", cells, 3, hard=True)
+        counts[f"sheet: kernels compiled, {triangles(cells)}"] = compiled() - before
+    return {COUNTS: counts}
 
 
-def grow(name: str, cells: int, times: int) -> dict:
-    """Memory after the second of some simulators, and after the last. times: simulators between."""
-    simulate(name, cells, 3)
-    simulate(name, cells, 3)
-    start = memory()
-    for _ in range(times):
-        simulate(name, cells, 3)
-    return {"start": start, "end": memory(), "times": times}
+def grow(name: str, cells: int, times: int) -> Rows:
+    """Memory that simulators leave behind."""
+    grown = growth(lambda: simulate(name, cells, 3), times)
+    return {COUNTS: {f"{name}: growth of resident memory over {times} simulators [MB]": grown}}
 
 
-def keep(cells: int, times: int) -> dict:
-    """The same for closed simulators of one cube that are still referenced."""
-    build, arguments = SCENES["cube"]
-    scene, kept, start = build(cells), [], 0.0
-    for _ in range(2 + times):
-        if len(kept) == 2:
-            start = memory()
-        with ts.Simulator(scene, **arguments) as sim:
+def keep(cells: int, times: int) -> Rows:
+    """The same of closed simulators of one cube that are still referenced."""
+    scene, kept = cube(cells), []
+
+    def closed() -> None:
+        with ts.Simulator(scene, **IMPLICIT) as sim:
             sim.advance(1)
         kept.append(sim)
-    return {"start": start, "end": memory(), "times": times}
+
+    return {COUNTS: {f"growth of resident memory over {times} kept closed simulators [MB]": growth(closed, times)}}
 
 
-def statics(cells: int) -> dict:
-    """Three static solves of a beam."""
-    return {str(k): timed(lambda: ts.solve_static(beam(cells))) for k in range(3)}
-
-
-def identify(cells: int) -> dict:
-    """Young's modulus from a sag: nine static solves, by bisection of the logarithm."""
+def statics(cells: int) -> Rows:
+    """Three static solves of a beam, and nine for Young's modulus from a sag, by bisection of the logarithm."""
 
     def sag(young: float) -> float:
         return ts.solve_static(beam(cells, young)).positions()[:, 1].min()
@@ -178,29 +199,28 @@ def identify(cells: int) -> dict:
             low, high = (middle, high) if sag(10.0**middle) < target else (low, middle)
         assert abs(middle - np.log10(3e6)) < 0.01
 
-    return timed(search)
+    waiting = {f"static solve, {k}": timed(lambda: sag(RUBBER["young"])) for k in ("first", "second", "third")}
+    return {WAITING: waiting | {"nine static solves": timed(search)}}
 
 
-def settings(cells: int) -> dict:
-    """Median times of changes to an open simulator, and the time of a new simulator."""
-    name = "cube"
-    build, arguments = SCENES[name]
-    simulate(name, cells, 2)
-    with ts.Simulator(build(cells), **arguments) as sim:
+def changes(cells: int) -> Rows:
+    """Times of changes to an open simulator, and of a new one."""
+    simulate("cube", cells, 2)
+    with simulator("cube", cells) as sim:
         walk(sim, 2)
         x, v = sim.positions(), sim.velocities()
-        changes = {
+        found = {
             "set_gravity": lambda: sim.set_gravity((0.0, -9.8, 0.0)),
             "set_contact": lambda: sim.set_contact("cube", "ground", friction=0.3),
             "set_state": lambda: sim.set_state(x, v),
             "reset": sim.reset,
             "set_material": lambda: sim.set_material("cube", young=2e6),
         }
-        found = {what: float(np.median([timed(change)["wall"] for _ in range(9)])) for what, change in changes.items()}
-    return found | {"a new Simulator": timed(lambda: ts.Simulator(build(cells), **arguments).close())["wall"]}
+        found = {what: often(change) for what, change in found.items()}
+    return {CHANGES: found | {"a new Simulator": often(lambda: simulator("cube", cells).close())}}
 
 
-def calls(*cells: int) -> dict:
+def calls(*cells: int) -> Rows:
     """Means of what the tenth to twentieth step of each scene launches and accesses; empty if the version does not count."""
     try:
         from taisoft.backend.counters import counting
@@ -208,67 +228,38 @@ def calls(*cells: int) -> dict:
         return {}
     found = {}
     for name, n in zip(("beam", "cube", "plane"), cells):
-        build, arguments = SCENES[name]
-        with ts.Simulator(build(n), **arguments) as sim:
+        with simulator(name, n) as sim:
             walk(sim, 10)
             with counting() as counts:
                 for _ in range(10):
                     sim.step()
-            found[name] = counts.totals(10)
-    return found
+            found |= {f"{name}: {what}": number for what, number in counts.totals(10).items()}
+    return {CALLS: found}
 
 
-def speed(cells: int, small: int, large: int) -> dict:
-    """Median seconds of steps, energies and a force differential of a beam, and of searches and contact steps of two sheets."""
-    steps = 20
+def speed(cells: int, *sheets: int) -> Rows:
+    """Steps, energies and a force differential of a beam, and searches and contact steps while sheets land.
+
+    A sheet takes only seven steps, the last three with impacts: impacts amplify rounding, and later steps of two versions would
+    need different numbers of iterations.
+    """
     with ts.Simulator(beam(cells), dt=2e-5, integrator="symplectic_euler") as sim:
         dx = 1e-3 * np.sin(sim.positions())
         found = {
-            "symplectic_euler step": often(lambda: walk(sim, steps)) / steps,
+            "symplectic_euler step": often(lambda: walk(sim, 20)) / 20,
             "energies": often(sim.energies),
             "force differential": often(lambda: sim.force_differential(dx)),
         }
     with ts.Simulator(beam(cells), dt=5e-3, integrator="implicit_euler") as sim:
         found["implicit_euler step"] = often(lambda: sim.advance(1))
-    return found | landing(small) | landing(large)
+    for n in sheets:
+        with simulator("sheet", n) as sim:
+            found[f"contact step, {triangles(n)}"] = often(lambda sim=sim: walk(sim, 7), before=sim.reset) / 7
+            assert len(sim.detect_contacts()) >= (n + 1) ** 2
+            found[f"search, {triangles(n)}"] = often(sim.detect_contacts)
+    return {SPEED: found}
 
-
-def landing(cells: int) -> dict[str, float]:
-    """Seconds of a search for contacts, and of a step while a sheet lands.
-
-    Only seven steps, the last three with impacts: impacts amplify rounding, and later steps of two versions would need different
-    numbers of iterations.
-    """
-    steps = 7
-    build, arguments = SCENES["sheet"]
-    with ts.Simulator(build(cells), **arguments) as sim:
-        seconds = often(lambda: walk(sim, steps), before=sim.reset) / steps
-        assert len(sim.detect_contacts()) >= (cells + 1) ** 2
-        return {f"search, {triangles(cells)}": often(sim.detect_contacts), f"contact step, {triangles(cells)}": seconds}
-
-
-def often(do: Callable, before: Callable = lambda: None) -> float:
-    """Median of the seconds of nine calls, after one that compiles. before: done each time, not timed."""
-    seconds = []
-    for _ in range(10):
-        before()
-        seconds.append(timed(do)["wall"])
-    return float(np.median(seconds[1:]))
-
-
-TASKS = {
-    "first": first,
-    "again": again,
-    "surfaces": surfaces,
-    "grow": grow,
-    "keep": keep,
-    "statics": statics,
-    "identify": identify,
-    "settings": settings,
-    "calls": calls,
-    "speed": speed,
-}
 
 if __name__ == "__main__":
-    arguments = [int(word) if word.isdigit() else word for word in sys.argv[2:]]
-    print(json.dumps(TASKS[sys.argv[1]](*arguments)))
+    task = globals()[sys.argv[1]]
+    print(json.dumps(task(*(int(word) if word.isdigit() else word for word in sys.argv[2:]))))
