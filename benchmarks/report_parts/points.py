@@ -1,4 +1,4 @@
-"""Figures 11 and 12 of the report: time of contact points per frame and over tets; all threads, one thread, interpreted.
+"""Figures 11 and 12 of the report: time of contact points over tets; all threads, one thread, interpreted.
 
 The interpreted loop is the report's first program, in Python, pair by pair: each of two triangles with overlapping boxes is
 mapped to the material space of the other's tet by barycentric coordinates, and Frank-Wolfe with steps 2 / (i + 2) finds its
@@ -27,7 +27,6 @@ from .page import Claim, Extent, Part, plot_png
 
 FRANK_WOLFE_STEPS, CLOSED = 32, 1e-4  # maximum; duality gap over the triangle's size at which it stops
 CONTACT_MODE = "distance_field"  # as in the report
-FILM, FRAMES = ("cubes 9", "cubes 5"), (20, 4)  # figure 11: a cube turns on another; full run: 1,944 triangles
 SIZES = ("cubes 5", "cubes 9", "cubes 11", "cubes 15", "cubes 20", "pile 6"), ("cubes 2", "cubes 5")  # full, quick
 ROUNDS, PLAIN_ROUNDS = (15, 3), 2
 MAX_INTERPRETED = 15_000  # maximum pairs for the interpreted loop
@@ -107,7 +106,7 @@ class PlainPoints:
 @dataclass
 class Points:
     """Contact points of a configuration; lists are wall seconds per round. first: first whole search with compilation; plain:
-    interpreted loop, empty if left out; deepest, plain_deepest: signed distance [m]; frames, plain_frames: of a film, if any."""
+    interpreted loop, empty if left out; deepest, plain_deepest: signed distance [m]."""
 
     setup: str
     tets: int
@@ -118,8 +117,11 @@ class Points:
     deepest: float
     plain: list[float] = field(default_factory=list)
     plain_deepest: float = 0.0
-    frames: list[list[float]] = field(default_factory=list)
-    plain_frames: list[float] = field(default_factory=list)
+
+    @property
+    def median(self) -> float:
+        """Median time [s]."""
+        return float(np.median(self.seconds))
 
 
 def setup_of(name: str) -> Setup:
@@ -128,34 +130,21 @@ def setup_of(name: str) -> Setup:
     return {"cubes": cubes_setup, "pile": pile_setup}[kind](int(cells))
 
 
-def point_seconds(rig: Rig, rounds: int) -> list[float]:
-    """Seconds of the contact points of a search per round, after warm-up."""
-    with watching() as spend:
-        return [spend(rig.search).seconds[POINTS] for _ in range(rounds)]
-
-
-def measure_size(name: str, runtime: Runtime, quick: bool, plain: bool) -> Points:
-    """Measure a configuration in the middle of its motion, and the frames of the film. plain: whether interpreted, too."""
+def measure_size(name: str, runtime: Runtime, quick: bool, interpret: bool) -> Points:
+    """Measure a configuration in the middle of its motion."""
     with Rig(setup_of(name), CONTACT_MODE, runtime) as rig:
-        loop, rounds = PlainPoints(rig) if plain else None, ROUNDS[quick]
         rig.place(0.5)
         begin = clock()
         rig.search()
-        first = clock() - begin
-        pairs, seconds = candidate_pairs(rig), point_seconds(rig, rounds)
+        first, pairs = clock() - begin, candidate_pairs(rig)
+        with watching() as spend:
+            seconds = [spend(rig.search).seconds[POINTS] for _ in range(ROUNDS[quick])]
         deepest = float(rig.detection.contacts().gap.min())
         found = Points(name, rig.tets, rig.detection.surface.n_triangles, len(pairs), first, seconds, deepest)
-        if loop and len(pairs) <= MAX_INTERPRETED:
-            depths: list[float] = []
+        if interpret and len(pairs) <= MAX_INTERPRETED:
+            loop, depths = PlainPoints(rig), []
             found.plain = repeated(lambda: depths.extend(loop.find(pairs)), PLAIN_ROUNDS)
             found.plain_deepest = min(depths)
-        for k in range(FRAMES[quick] if name == FILM[quick] else 0):
-            rig.place(k / max(FRAMES[quick] - 1, 1))
-            rig.search()
-            found.frames.append(point_seconds(rig, rounds))
-            if loop:
-                pairs = candidate_pairs(rig)
-                found.plain_frames += repeated(lambda pairs=pairs: loop.find(pairs), 1)
     return found
 
 
@@ -164,9 +153,9 @@ def measure_all(extent: Extent) -> tuple[str, list[Points], list[Points]]:
     quick = extent.quick
     with closing(open_runtime(extent.arch, "f32", "the report's contact points")) as runtime:
         where = "the GPU" if extent.arch == "cuda" else f"{threads()} threads"
-        many = [measure_size(name, runtime, quick, plain=True) for name in SIZES[quick]]
+        many = [measure_size(name, runtime, quick, interpret=True) for name in SIZES[quick]]
     with closing(open_runtime("cpu", "f32", "the report's contact points")) as runtime, on_one_thread():
-        return where, many, [measure_size(name, runtime, quick, plain=False) for name in SIZES[quick]]
+        return where, many, [measure_size(name, runtime, quick, interpret=False) for name in SIZES[quick]]
 
 
 # --- what it says -------------------------------------------------------------------------------------------------------
@@ -174,43 +163,36 @@ def measure_all(extent: Extent) -> tuple[str, list[Points], list[Points]]:
 
 def claims_of(where: str, many: list[Points], one: list[Points]) -> list[Claim]:
     """Claims of figures 11 and 12."""
-    film = next(p for p in many if p.frames)
-    per_frame = [p / np.median(c) for c, p in zip(film.frames, film.plain_frames)]
     both = [(p, q) for p, q in zip(many, one) if p.plain]
-    by_compiling = [np.median(p.plain) / np.median(q.seconds) for p, q in both]
-    by_threads = [np.median(q.seconds) / np.median(p.seconds) for p, q in both]
-    tets = [p.tets for p, _ in both]
-    grown, _ = exponent(tets, [np.median(p.seconds) for p, _ in both])
-    plain, _ = exponent(tets, [np.median(p.plain) for p, _ in both])
+    tets, plain = [p.tets for p, _ in both], [float(np.median(p.plain)) for p, _ in both]
+    gains = [slow / p.median for slow, (p, _) in zip(plain, both)]
+    by_compiling = [slow / q.median for slow, (_, q) in zip(plain, both)]
+    by_threads = [q.median / p.median for p, q in both]
     first = [p.first for p in many]
+    grown, grown_plain = exponent(tets, [p.median for p, _ in both])[0], exponent(tets, plain)[0]
     return [
         Claim(
-            "in every frame the parallel computation is faster than the plain one, up to tenfold (figure 11).",
-            min(per_frame) > 1.0 and max(per_frame) >= TENFOLD,
-            f"on {where} the contact points of a frame take {min(per_frame):,.0f} to {max(per_frame):,.0f} times less than in "
-            "the interpreted loop over the same pairs.",
+            "the parallel computation is always faster than the plain one, up to tenfold (figure 11).",
+            min(gains) > 1.0 and max(gains) >= TENFOLD,
+            f"on {where} it takes {min(gains):,.0f} to {max(gains):,.0f} times less than the loop over the same pairs.",
         ),
         Claim(
             "parallel execution causes this speed-up.",
             min(by_threads) > max(by_compiling),
             f"compiled for one thread they take {min(by_compiling):,.0f} to {max(by_compiling):,.0f} times less than "
             f"interpreted; on {where} they are {min(by_threads):.2f} to {max(by_threads):.2f} times as fast as that.",
-            "Compilation instead of interpretation gains most, as it would in a GPU kernel; below "
-            f"{SERIAL_BELOW:,} triangles the CPU uses one thread, since waking others takes longer.",
+            f"Below {SERIAL_BELOW:,} triangles the CPU uses one thread, since waking others takes longer.",
         ),
         Claim(
             "the parallel computation is slow at its start, and steady afterwards (figure 11).",
-            all(p.first > 10 * np.median(p.seconds) for p in many),
-            f"the first search takes {min(first):.1f} to {max(first):.1f} s, its contact points "
-            f"{ms(np.median([s for p in many for s in p.seconds]))} ms afterwards.",
-            "Here the start compiles kernels, there it moved data.",
+            all(p.first > 10 * p.median for p in many),
+            f"the first search takes {min(first):.2g} to {max(first):.2g} s, the first of all compiles kernels.",
         ),
         Claim(
             "its time stays near zero however many tets there are, while the plain one's grows (figure 12).",
-            grown < FLAT < plain,
-            f"over {tets[0]:,} to {tets[-1]:,} tets it grows like tets^{grown:.2f} on {where}, tets^{plain:.2f} interpreted.",
-            "On any machine, work grows with the pairs of near triangles on touching surfaces, about tets^(2/3); it is near zero "
-            "only in comparison with the interpreted loop.",
+            grown < FLAT < grown_plain,
+            f"{tets[0]:,} to {tets[-1]:,} tets: it grows like tets^{grown:.2f} on {where}, tets^{grown_plain:.2f} interpreted.",
+            "Work grows with the pairs of near triangles on touching surfaces, about tets^(2/3).",
         ),
     ]
 
@@ -219,7 +201,7 @@ def size_table(where: str, many: list[Points], one: list[Points]) -> str:
     """A row per configuration."""
 
     def faster(pair: tuple[Points, Points]) -> str:
-        return f"{np.median(pair[0].plain) / np.median(pair[0].seconds):,.0f}" if pair[0].plain else "-"
+        return f"{np.median(pair[0].plain) / pair[0].median:,.0f}" if pair[0].plain else "-"
 
     columns = (
         ("<scene", "{[0].setup}"),
@@ -237,20 +219,15 @@ def size_table(where: str, many: list[Points], one: list[Points]) -> str:
 
 
 def draw(where: str, many: list[Points], one: list[Points]) -> bytes:
-    """Figure 11 on the left, 12 on the right."""
-    frames = Panel("contact points of each frame", "frame", "ms", log="y")
-    sizes = Panel("over tets; squares: the pile", "tets", "ms", log="xy")
+    """Figure 12."""
+    panel = Panel("contact points; squares: the pile", "tets", "ms", log="xy")
     for k, (label, found) in enumerate(((where, many), ("one thread", one))):
-        for p in found:
-            if p.frames:
-                frames.curve(range(len(p.frames)), [1e3 * np.median(f) for f in p.frames], label, k, "-")
         for kind, line in (("cubes", "o-"), ("pile", "s-")):
             own = [p for p in found if p.setup.startswith(kind)]
-            sizes.curve([p.tets for p in own], [1e3 * np.median(p.seconds) for p in own], label, k, line)
-    film, plain = next(p for p in many if p.frames), [p for p in many if p.plain]
-    frames.curve(range(len(film.frames)), [1e3 * s for s in film.plain_frames], "interpreted", 2, "-")
-    sizes.curve([p.tets for p in plain], [1e3 * np.median(p.plain) for p in plain], "interpreted", 2)
-    return plot_png(frames, sizes)
+            panel.curve([p.tets for p in own], [1e3 * p.median for p in own], label, k, line)
+    plain = [p for p in many if p.plain]
+    panel.curve([p.tets for p in plain], [1e3 * np.median(p.plain) for p in plain], "interpreted", 2)
+    return plot_png(panel)
 
 
 def measure(extent: Extent) -> Part:
@@ -267,6 +244,7 @@ def measure(extent: Extent) -> Part:
         [size_table(where, many, one)],
         {"points.png": draw(where, many, one)},
     )
+    part.short.append("figure 11 is over frames, here sizes take their place.")
     if extent.arch == "cpu":
         part.short.append(f"the report has a GPU, this run {where} of a processor; `--arch cuda` runs it on a GPU.")
     if left := [p.setup for p in many if not p.plain]:
