@@ -115,8 +115,7 @@ def _problems(quick: bool, document: Document) -> list[contact_problems.Row]:
         document.add(f"Left out: {absent}.")
         return []
     rows = contact_problems.measure(names, 1 if quick else REPEATS)
-    rows_text = markdown(contact_problems.HEADINGS, [row.cells for row in rows], left=(0, 2, 9))
-    document.add(f"{rows_text}\n\n{contact_problems.summary(rows)}")
+    document.add(f"{contact_problems.row_table(rows)}\n\n{contact_problems.summary(rows)}")
     return rows
 
 

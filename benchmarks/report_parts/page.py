@@ -22,6 +22,7 @@ from ..charts import Panel, figure_of
 from ..document import default_out, earlier_numbers, plain, table
 
 AGREE, PARTLY, DISAGREE, MISSING = "agree", "partly", "disagree", "not measured"
+HOLDS = {"collision": "cells", "contact": "touching"}  # what results that can be judged hold
 PALETTE = 128  # colours of a picture, enough to avoid bands in shaded scenes
 DPI = 85
 
@@ -95,7 +96,7 @@ def numbers_of(name: str, quick: bool, arch: str) -> dict:
     """Numbers of `taisoft bench NAME`: of a whole run on this machine those in benchmarks/results, else of a run now."""
     stored = default_out(arch, name)
     known = None if quick else earlier_numbers(stored)
-    if known is not None and not known.get("quick"):
+    if known is not None and not known.get("quick") and HOLDS[name] in known:
         return known
     with TemporaryDirectory() as folder:
         path = Path(folder) / f"{name}.json" if quick else stored
