@@ -28,6 +28,7 @@ from taisoft.files import write_bytes
 from taisoft.machine import usable_cores
 from taisoft.output.files import make_folder
 from taisoft.output.report import json_text
+from taisoft.processes import start_python
 
 from .cuda_parts import JOBS, run_job
 from .document import header, table
@@ -41,7 +42,7 @@ TESTS, RESULTS = "tests/backend/test_arch.py", "PASSED|FAILED|ERROR|SKIPPED|XFAI
 
 @dataclass(frozen=True)
 class Part:
-    """A part of the page. seconds: time limit; unused time of earlier parts is added."""
+    """A part of the page. command: arguments of Python; seconds: time limit; unused time of earlier parts is added."""
 
     name: str
     title: str
@@ -62,9 +63,9 @@ class Outcome:
 
 def make_parts(arch: str, quick: bool) -> list[Part]:
     """All parts, the most important first."""
-    child = (sys.executable, "-m", "taisoft", "bench", "cuda_check", "--arch", arch, *(("--quick",) if quick else ()), "--job")
+    child = ("-m", "taisoft", "bench", "cuda_check", "--arch", arch, *(("--quick",) if quick else ()), "--job")
     side_by_side = ("-n", str(min(8, len(usable_cores())))) if find_spec("xdist") else ()  # most of their time is compilation
-    pytest = (sys.executable, "-m", "pytest", "-v", "--tb=short", "-p", "no:cacheprovider", *side_by_side, "-m", "cuda", TESTS)
+    pytest = ("-m", "pytest", "-v", "--tb=short", "-p", "no:cacheprovider", *side_by_side, "-m", "cuda", TESTS)
     return [
         Part("tests", "Tests marked cuda", pytest, 150.0),
         *(Part(name, title, (*child, name), seconds) for name, (title, seconds, _) in JOBS.items()),
@@ -74,19 +75,9 @@ def make_parts(arch: str, quick: bool) -> list[Part]:
 def run_part(part: Part, limit: float) -> Outcome:
     """Run a part for at most `limit` seconds, then kill its process group."""
     outcome, start = Outcome(part), time.monotonic()
-    path = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
-    environment = os.environ | {"PYTHONPATH": path, "PYTHONUNBUFFERED": "1", "TI_ADVANCED_OPTIMIZATION": "1"}  # tests: not else
-    process = subprocess.Popen(
-        part.command,
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-        errors="replace",
-        env=environment,
-        cwd=ROOT,
-        start_new_session=True,
-    )
+    environment = {"PYTHONUNBUFFERED": "1", "TI_ADVANCED_OPTIMIZATION": "1"}  # tests: not else
+    output = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True, "errors": "replace"}
+    process = start_python(*part.command, environment=environment, cwd=ROOT, **output)
     try:
         printed, _ = process.communicate(timeout=limit)
         outcome.ended = "ok" if process.returncode == 0 else "failed"

@@ -5,7 +5,6 @@
 """
 
 import json
-import sys
 
 from benchmarks import cuda_check
 from benchmarks.cuda_check import Part, main, parse_test
@@ -16,7 +15,7 @@ RERUN = {"scene": "beam", "integrator": "bdf2", "reruns": 3, "spread": 1.5e-6}
 
 def fake(name: str, code: str, seconds: float = 20.0) -> Part:
     """A part that runs a line of Python."""
-    return Part(name, f"Part {name}", (sys.executable, "-S", "-c", f"import time\n{code}"), seconds)
+    return Part(name, f"Part {name}", ("-S", "-c", f"import time\n{code}"), seconds)
 
 
 def test_failing_parts_leave_the_results_of_others(tmp_path, monkeypatch):
