@@ -86,28 +86,24 @@ def make_block(integrator: str) -> "ts.gym.Env":
     return ts.gym.Env(block, nothing, height, zero, action_space=space, **given)
 
 
-def seconds_of(call: Callable[[], object]) -> float:
-    """Wall seconds of a call."""
+def seconds_of(call: Callable[[], object], times: int = 1) -> float:
+    """Wall seconds of calls."""
     start = time.perf_counter()
-    call()
+    for _ in range(times):
+        call()
     return time.perf_counter() - start
 
 
 def measure_block(integrator: str, times: int) -> dict:
     """Seconds of all that an episode consists of."""
-    make, found = partial(make_block, integrator), {}
+    make = partial(make_block, integrator)
     start = time.perf_counter()
     with make() as env:
-        found["make"] = time.perf_counter() - start
-        action = env.action_space.low
-        found["first reset"] = seconds_of(env.reset)
-        found["first step"] = seconds_of(lambda: env.step(action))
-        for _ in range(20):  # it lands
-            env.step(action)
-        pairs = []
-        for _ in range(times // BLOCK):
-            steps = seconds_of(lambda: [env.step(action) for _ in range(BLOCK)])
-            pairs.append((steps, seconds_of(lambda: [env.sim.advance(env.frame_skip) for _ in range(BLOCK)])))
+        found, step = {"make": time.perf_counter() - start}, partial(env.step, env.action_space.low)
+        found |= {"first reset": seconds_of(env.reset), "first step": seconds_of(step)}
+        seconds_of(step, 20)  # it lands
+        advance = partial(env.sim.advance, env.frame_skip)
+        pairs = [(seconds_of(step, BLOCK), seconds_of(advance, BLOCK)) for _ in range(times // BLOCK)]
         found["step"], found["advance"] = (np.median(pairs, axis=0) / BLOCK).tolist()
         for name, reset in (("reset", env.reset), ("sim.reset", env.sim.reset)):
             resets = []
@@ -200,9 +196,9 @@ def measure_work(work: Work, setting: Setting, processes: int, rounds: int) -> d
         actions = np.zeros((processes, 1), np.float32)
         for _ in range(rounds + 1):
             env.reset()
-            one.append(n / seconds_of(lambda: [env.step(actions[0]) for _ in range(n)]))
+            one.append(n / seconds_of(partial(env.step, actions[0]), n))
             envs.reset()
-            all_of_them.append(processes * n / seconds_of(lambda: [envs.step(actions) for _ in range(n)]))
+            all_of_them.append(processes * n / seconds_of(partial(envs.step, actions), n))
     finally:
         envs.close()
         env.close()

@@ -26,8 +26,9 @@ from taisoft.linear.block_csr import assemble, build_block_csr
 from taisoft.machine import summarise
 from taisoft.output.tables import percent, spread_of
 
+from .children import in_child
 from .document import Limit, begin, table
-from .runner import parse_result, print_result, progress, quick_options, run_python, without_warnings
+from .runner import progress, quick_options, timed, without_warnings
 
 COR, SNH, SVK = "corotational", "stable_neo_hookean", "st_venant_kirchhoff"
 STEPS, ROUNDS = 10, 7
@@ -117,14 +118,7 @@ def in_turn(case: tuple, cells: tuple, rounds: int, prepare: Callable) -> list[t
         calls = [prepare(sim) for sim in sims]
         for call in calls:
             call()
-        return [tuple(seconds_of(call) for call in calls) for _ in range(rounds)]
-
-
-def seconds_of(call: Callable) -> float:
-    """Seconds of a call."""
-    start = time.perf_counter()
-    call()
-    return (time.perf_counter() - start) / STEPS
+        return [tuple(timed(call)[1] / STEPS for call in calls) for _ in range(rounds)]
 
 
 def steps(sim: ts.Simulator) -> Callable:
@@ -139,32 +133,28 @@ def assemblies(projected: bool, sim: ts.Simulator) -> Callable:
     return lambda: [assemble(state.model, matrix, projected) for _ in range(STEPS)]
 
 
-def first_step(name: str) -> None:
-    """Print the seconds from a new simulator to the end of its first implicit step."""
+def first_step(name: str) -> float:
+    """The seconds from a new simulator to the end of its first implicit step."""
     with without_warnings():
         register()
         law, numbers, *_ = CASES.get(name, (SNH, HOOKE))
         start = time.perf_counter()
         with simulator(law, numbers, (3, 2, 2), "implicit_euler") as sim:
             sim.step()
-        print_result(time.perf_counter() - start)
+        return time.perf_counter() - start
 
 
 def compile_seconds(name: str) -> float:
     """The same in a new process that has no stored kernels."""
     with tempfile.TemporaryDirectory() as folder:
-        code = f"from benchmarks.laws import first_step; first_step({name!r})"
-        lines = run_python(f"the first step of {name}", "-c", code, cache=Path(folder))
-    return next(filter(None, map(parse_result, lines)))
+        return in_child(f"the first step of {name}", first_step, name, cache=Path(folder))
 
 
 def measure(name: str, sizes: dict, rounds: int) -> Cost:
     """All of a law."""
     case = CASES[name]
     progress(name)
-    start = time.perf_counter()
-    ts.check_law(case[0])
-    check = time.perf_counter() - start
+    _, check = timed(partial(ts.check_law, case[0]))
     step = in_turn(case, sizes["step"], rounds, steps)
     others = [in_turn(case, sizes["assembly"], rounds, partial(assemblies, projected)) for projected in (False, True)]
     ratios = [[a / b for a, b in pairs] for pairs in (step, *others)]

@@ -1,6 +1,6 @@
 """Pictures: what one costs at 1280 x 720, and how much longer runs with pictures take.
 
-taisoft bench pictures [--quick] [--out FILE.json]
+taisoft bench pictures [--quick] [--out [FILE.json]]
 
 A scene of about 20,000 triangles, a ball and a cube on the ground, is drawn, and its picture coded as PNG. Each is the median of
 rounds, with the range. Then runs of demos without pictures, with 60 that are drawn in a process of their own, and with 60 drawn
@@ -16,19 +16,17 @@ import time
 from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
-
-import numpy as np
+from statistics import median
 
 import taisoft as ts
 from taisoft.cli.scene_file import load_scene
 from taisoft.output.frames import png_bytes
-from taisoft.output.tables import markdown
 from taisoft.view.offscreen import Offscreen
 from taisoft.view.pictures import PictureOptions, PictureProcess, picture_writer
 from taisoft.view.sampling import Sampler
 
-from .document import Limit, begin, check_out
-from .runner import make_parser, progress
+from .document import Limit, begin, table
+from .runner import progress, quick_options
 
 ROUNDS, RUN_ROUNDS, QUICK_ROUNDS = 15, 5, 3
 BALL, CUBE = 32, 24  # cells
@@ -115,43 +113,44 @@ def timed_run(sim: ts.Simulator, seconds: float, where: str) -> dict[str, float]
 
 def picture_table(found: dict) -> str:
     """Times of a picture."""
-    rows = []
-    for what in ("kernels", "PNG"):
-        t, cpu = (1e3 * np.array(found[what][clock]) for clock in ("wall", "cpu"))
-        rows.append((what, f"{np.median(t):.1f}", f"{t.min():.1f} to {t.max():.1f}", f"{np.median(cpu):.1f}"))
-    return markdown(("one picture", "median [ms]", "range [ms]", "CPU [ms]"), rows, left=(0,))
+    columns = (
+        ("<one picture", "{}"),
+        ("median [ms]", lambda what: f"{1e3 * median(found[what]['wall']):.1f}"),
+        ("range [ms]", lambda what: "{:.1f} to {:.1f}".format(*(1e3 * of(found[what]["wall"]) for of in (min, max)))),
+        ("CPU [ms]", lambda what: f"{1e3 * median(found[what]['cpu']):.1f}"),
+    )
+    return table(("kernels", "PNG"), columns)
 
 
 def run_table(found: dict[str, dict]) -> str:
-    """Times of runs."""
-    rows = []
-    for name, one in found.items():
-        walls = [one["without"]["wall"], one["with"]["wall"], one["with"]["drawing"]]
-        walls_and_ratios = [*(f"{np.median(wall):.2f}" for wall in walls), spread(one, "with"), spread(one, "between")]
-        cpu = [*(np.median(one[where]["cpu"]) for where in ("without", "with")), ratio(one["with"], one["without"], "cpu")]
-        rows.append((name, *walls_and_ratios, *(f"{value:.2f}" for value in cpu)))
-    headings = ("without [s]", "with [s]", "of it kept [s]", "ratio", "drawn between steps", "CPU without [s]", "CPU with [s]")
-    return markdown((f"{PICTURES} pictures", *headings, "CPU ratio"), rows, left=(0,))
+    """Times of runs, medians over rounds."""
 
+    def seconds(where: str, clock: str) -> Callable[[str], str]:
+        return lambda name: f"{median(found[name][where][clock]):.2f}"
 
-def spread(one: dict, where: str) -> str:
-    """Median and range over rounds of the wall time with pictures over that without."""
-    ratios = np.array(one[where]["wall"]) / np.array(one["without"]["wall"])
-    return f"{np.median(ratios):.2f} ({ratios.min():.2f} to {ratios.max():.2f})"
+    def ratios(name: str, where: str, clock: str) -> list[float]:
+        return [a / b for a, b in zip(found[name][where][clock], found[name]["without"][clock])]
 
+    def ratio(where: str) -> Callable[[str], str]:
+        return lambda name: "{:.2f} ({:.2f} to {:.2f})".format(*(of(ratios(name, where, "wall")) for of in (median, min, max)))
 
-def ratio(a: dict, b: dict, clock: str = "wall") -> float:
-    """Median over rounds of a's time over that of b."""
-    return float(np.median(np.array(a[clock]) / np.array(b[clock])))
+    columns = (
+        (f"<{PICTURES} pictures", "{}"),
+        ("without [s]", seconds("without", "wall")),
+        ("with [s]", seconds("with", "wall")),
+        ("of it kept [s]", seconds("with", "drawing")),
+        ("ratio", ratio("with")),
+        ("drawn between steps", ratio("between")),
+        ("CPU without [s]", seconds("without", "cpu")),
+        ("CPU with [s]", seconds("with", "cpu")),
+        ("CPU ratio", lambda name: f"{median(ratios(name, 'with', 'cpu')):.2f}"),
+    )
+    return table(found, columns)
 
 
 def main(argv=None) -> int:
     """Measure and print. Raises OutputError if a file cannot be written."""
-    parser = make_parser("pictures", __doc__)
-    parser.add_argument("--quick", action="store_true", help="a coarse scene, one demo, few rounds, no limit")
-    parser.add_argument("--out", type=Path, metavar="FILE.json", help="write FILE.json and FILE.md too")
-    options = parser.parse_args(argv)
-    check_out(options.out, ".json")
+    options = quick_options("pictures", __doc__, argv, "a coarse scene, one demo, few rounds, no limit")
     document, numbers = begin("Pictures", "arch cpu")
     progress("pictures")
     one = measure_picture(options.quick)
@@ -162,7 +161,7 @@ def main(argv=None) -> int:
         progress(name)
         runs[name] = measure_run(name, seconds / 10 if options.quick else seconds, 1 if options.quick else RUN_ROUNDS)
     document.add(f"## Runs\n\n{run_table(runs)}")
-    limits = [] if options.quick else [Limit("a picture [ms]", 1e3 * float(np.median(one["kernels"]["wall"])), PICTURE)]
+    limits = [] if options.quick else [Limit("a picture [ms]", 1e3 * median(one["kernels"]["wall"]), PICTURE)]
     return document.finish(options, numbers | {"picture": one, "runs": runs}, limits)
 
 

@@ -1,6 +1,6 @@
 """Robots coupled to soft bodies: order of the coupling's error, robots from packages, cost of a step.
 
-taisoft bench robots [--quick] [--out FILE.json]
+taisoft bench robots [--quick] [--out [FILE.json]]
 
 Coupling: a block rests on a plate of twice its mass, or a fifth, on a spring, and both sway. Period and amplitude (of the rise
 from the lowest point to the next top) are compared with those of the closed form, and weak coupling with iterated at the same dt.
@@ -13,9 +13,8 @@ import copy
 import importlib.util
 import sys
 import tempfile
-import time
-import warnings
 from collections.abc import Iterator
+from itertools import product
 from pathlib import Path
 from statistics import median
 
@@ -25,11 +24,12 @@ import taisoft as ts
 from taisoft.cli.scene_file import load_scene
 from taisoft.machine import summarise
 
-from .document import Limit, begin, check_out, exponent, table, timed_cells
-from .runner import make_parser, progress
+from .document import Limit, begin, exponent, table, timed_cells
+from .runner import REST, Stopwatch, clock, progress, quick_options, warm_up, without_warnings
 
 STIFFNESS, BLOCK, G = 400.0, 1.0, 9.81  # of the spring [N/m], mass of the block [kg]
 HEAVY, LIGHT = 2.0, 0.2  # plates [kg]
+ERRORS = tuple(product(("weak", "iterated"), ("period", "amplitude")))
 DT, ITERATIONS = (0.008, 0.004, 0.002, 0.001), 30
 PLATE = """<mujoco><option timestep="0.001"/><worldbody><body name="plate">
 <joint name="lift" type="slide" axis="0 0 1" stiffness="{stiffness}"/><geom type="box" size=".2 .2 .02" mass="{mass}"/>
@@ -92,11 +92,7 @@ def coupling_table(rows: list[dict]) -> str:
     columns = (
         ("plate [kg]", "{[mass]:g}"),
         ("dt [ms]", lambda row: f"{1e3 * row['dt']:g}"),
-        *(
-            (f"{name}: error of the {what}", cell(name, what))
-            for name in ("weak", "iterated")
-            for what in ("period", "amplitude")
-        ),
+        *((f"{name}: error of the {what}", cell(name, what)) for name, what in ERRORS),
         ("between the two", lambda row: "-" if not row["apart"] < 1.0 else f"{row['apart']:.2e}"),
         ("steps that did not agree", lambda row: str(row["iterated"]["failed"])),
     )
@@ -107,11 +103,7 @@ def orders(rows: list[dict]) -> dict[str, float]:
     """Exponents of dt of the errors with the heavy plate."""
     heavy = [row for row in rows if row["mass"] == HEAVY]
     dt = [row["dt"] for row in heavy]
-    found = {
-        f"{name}, {what}": exponent(dt, [r[name][what] for r in heavy])[0]
-        for name in ("weak", "iterated")
-        for what in ("period", "amplitude")
-    }
+    found = {f"{name}, {what}": exponent(dt, [row[name][what] for row in heavy])[0] for name, what in ERRORS}
     return found | {"between the two": exponent(dt, [row["apart"] for row in heavy])[0]}
 
 
@@ -145,9 +137,9 @@ def free_and_hit(name: str, path: Path, servo: bool) -> dict:
         model.opt.timestep = 0.01 / np.ceil(0.01 / robot.model.opt.timestep - 1e-9)
         n, same, worst, free, pressed, seconds = round(0.01 / model.opt.timestep), True, 0.0, 0, 0, []
         for _ in range(FREE_STEPS + BALL_STEPS):
-            begin = time.perf_counter()
+            start = clock()
             report = sim.step()
-            seconds.append(time.perf_counter() - begin)
+            seconds.append(clock() - start)
             contacts = sim.contacts()
             if not pressed and not contacts.impulse.any():
                 mujoco.mj_step(model, data, n)
@@ -160,18 +152,9 @@ def free_and_hit(name: str, path: Path, servo: bool) -> dict:
                 summed = -contacts.impulse[np.isin(contacts.body_b, own)].sum(axis=0) / sim.dt
                 if (size := np.abs(summed).max(initial=0.0)) > 1e-3:  # [N]
                     worst = max(worst, float(np.abs(sim.robot.link_wrench(link).force - summed).max() / size))
-    kinds = [one.shape for one in scene.obstacles]
-    triangles = sum(len(shape.triangles) for shape in kinds if isinstance(shape, ts.MeshObstacle))
-    row = {
-        "robot": name,
-        "shapes": len(shapes),
-        "triangles": triangles,
-        "same": same,
-        "free": free,
-        "pressed": pressed,
-        "worst": worst,
-    }
-    return row | {"step": median(seconds)}
+    triangles = sum(len(one.shape.triangles) for one in scene.obstacles if isinstance(one.shape, ts.MeshObstacle))
+    row = {"robot": name, "shapes": len(shapes), "triangles": triangles, "same": same, "free": free, "pressed": pressed}
+    return row | {"worst": worst, "step": median(seconds)}
 
 
 def package_table(rows: list[dict]) -> str:
@@ -191,63 +174,43 @@ def package_table(rows: list[dict]) -> str:
 # --- cost ---------------------------------------------------------------------------------------------------------------
 
 
-def gripper_cost(steps: int) -> dict:
+def gripper_cost(steps: int) -> dict[str, list[float]]:
     """Times of steps of the demo, and of what is not the bodies' in them [s]."""
     scene, solver = load_scene("robot_gripper")
-    given = {key: value for key, value in solver.items() if key not in ("seconds", "fps")}
-    whole, bodies = [], []
-    with ts.Simulator(scene, **given) as sim:
-        for _ in range(20):
-            sim.step()
-        sim.reset()
-        own = sim._dynamics.advance
-
-        def timed(n: int):
-            begin = time.perf_counter()
-            try:
-                return own(n)
-            finally:
-                bodies.append(time.perf_counter() - begin)
-
-        sim._dynamics.advance = timed
-        for _ in range(steps):
-            begin = time.perf_counter()
-            sim.step()
-            whole.append(time.perf_counter() - begin)
-    return {"whole": whole, "exchange": [a - b for a, b in zip(whole, bodies)]}
+    watch = Stopwatch()
+    with ts.Simulator(scene, **{key: value for key, value in solver.items() if key not in ("seconds", "fps")}) as sim:
+        warm_up(sim, 20)
+        with watch.on([("bodies", sim._dynamics, "advance")]):
+            parts = [watch.parts_of(sim.step) for _ in range(steps)]
+    return {"step": [sum(one.values()) for one in parts], "of it MuJoCo and exchange": [one[REST] for one in parts]}
 
 
-def cost_table(cost: dict) -> str:
+def cost_table(cost: dict[str, list[float]]) -> str:
     """Steps and exchange."""
-    rows = [("step", cost["whole"]), ("of it MuJoCo and exchange", cost["exchange"])]
-    return table(
-        rows,
-        (("<", "{[0]}"), ("median [ms]", lambda row: timed_cells(row[1])[0]), ("spread", lambda row: timed_cells(row[1])[1])),
+    columns = (
+        ("<", "{[0]}"),
+        ("median [ms]", lambda row: timed_cells(row[1])[0]),
+        ("spread", lambda row: timed_cells(row[1])[1]),
     )
+    return table(cost.items(), columns)
 
 
 def limits_of(found: dict[str, float], rows: list[dict], robots: list[dict]) -> list[Limit]:
     """Orders, agreement, bits and sums."""
     limits = [Limit("weak coupling: order of its difference to the iterated one", found["between the two"], 0.8, at_least=True)]
-    limits += [
-        Limit(f"order of the error: {name}", p, 0.8, at_least=True) for name, p in found.items() if name.startswith("weak")
-    ]
+    limits += [Limit(f"order of the error: {name}", p, 0.8, at_least=True) for name, p in found.items() if "weak" in name]
     limits.append(Limit("iterated steps that did not agree", sum(row["iterated"]["failed"] for row in rows), 0))
     for row in robots:
+        free = row["free"] if row["same"] else 0
         limits.append(Limit(f"{row['robot']}: wrench off the sum over contacts", row["worst"], 1e-6))
-        same = row["free"] if row["same"] else 0
-        limits.append(Limit(f"{row['robot']}: free steps as in MuJoCo alone", same, FREE_STEPS // 2, at_least=True))
+        limits.append(Limit(f"{row['robot']}: free steps as in MuJoCo alone", free, FREE_STEPS // 2, at_least=True))
         limits.append(Limit(f"{row['robot']}: steps with contact", row["pressed"], 1, at_least=True))
     return limits
 
 
 def main(argv=None) -> int:
     """Measure and print. Raises OutputError if a file cannot be written, SceneError without MuJoCo."""
-    parser = make_parser("robots", __doc__)
-    parser.add_argument("--quick", action="store_true", help="two dt, no robots from packages, no limits")
-    parser.add_argument("--out", type=Path, metavar="FILE.json", help="write FILE.json and FILE.md too")
-    options = parser.parse_args(argv)
-    check_out(options.out, ".json")
+    options = quick_options("robots", __doc__, argv, "two dt, no robots from packages, no limits")
     document, numbers = begin("Robots", "arch cpu", packages=("taichi", "numpy", "mujoco-core", "pybullet", "dm-control"))
     rows, robots = [], []
     for mass in (HEAVY,) if options.quick else (HEAVY, LIGHT):
@@ -257,8 +220,7 @@ def main(argv=None) -> int:
     found = orders(rows)
     document.add("## Coupling\n\n" + coupling_table(rows))
     document.add("Orders in dt with the heavy plate: " + ", ".join(f"{name} {p:.2f}" for name, p in found.items()) + ".")
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)  # of meshes that bound no solid
+    with without_warnings():  # of meshes that bound no solid
         for name, path, servo in () if options.quick else installed():
             progress(name)
             robots.append(free_and_hit(name, path, servo))
