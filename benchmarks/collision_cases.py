@@ -134,5 +134,3 @@ REPORT = (  # 990, 215 and 240 tets
     Setup("cube on box", partial(cubes_on_boxes, (3, 3, 3), (0.0,))),
     Setup("two on two", partial(cubes_on_boxes, (2, 2, 2), (-1.0, 1.0))),
 )
-# [ms] quoted time of a whole step of the older Python code on this class of machine
-OLDER = {"sheet and cube": (2400.0, 4200.0), "cube on box": (1435.0, 1435.0), "two on two": (1900.0, 1900.0)}

@@ -16,7 +16,6 @@ import argparse
 import math
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 from taisoft.errors import OutputError, SimulationError
@@ -75,40 +74,23 @@ def gain_table(rows: Sequence[Row]) -> str:
 # --- tables -------------------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class Growth:
-    """Exponents over the tets: time of a step (all meshes, and the last two), set-up time, bytes of the fields; nan for fewer
-    than two meshes."""
-
-    kind: str
-    meshes: int
-    step: float
-    step_at_last: float
-    setup: float
-    memory: float
-
-
 def measured(rows: Sequence[Row]) -> list[Row]:
     """The rows with times."""
     return [row for row in rows if row.samples]
 
 
-def growths(rows: Sequence[Row]) -> list[Growth]:
-    """Exponents per kind of work, in the order of the rows."""
+def growths(rows: Sequence[Row]) -> list[dict]:
+    """Per kind of work: exponents over the tets of the time of a step, of setting up and of the bytes of the fields."""
     found = []
     for kind in dict.fromkeys(row.kind for row in measured(rows)):
         own = sorted((row for row in measured(rows) if row.kind == kind), key=lambda row: row.tets)
-        tets, step = [row.tets for row in own], [row.timing.median for row in own]
-        found.append(
-            Growth(
-                kind,
-                len(own),
-                exponent(tets, step)[0],
-                exponent(tets[-2:], step[-2:])[0],
-                exponent(tets, [r.setup_seconds for r in own])[0],
-                exponent(tets, [sum(r.field_bytes.values()) for r in own])[0],
-            )
-        )
+        numbers = {
+            "step": [row.timing.median for row in own],
+            "setup": [row.setup_seconds for row in own],
+            "memory": [sum(row.field_bytes.values()) for row in own],
+        }
+        exponents = {name: exponent([row.tets for row in own], values)[0] for name, values in numbers.items()}
+        found.append({"kind": kind, "meshes": len(own)} | exponents)
     return found
 
 
@@ -184,14 +166,11 @@ def copy_table(copies: Sequence[Copy]) -> str:
     return table(copies, (("<copy by", "{.by}"), ("threads", "{.threads}"), ("GB/s", lambda c: f"{c.rate / 1e9:.3g}")))
 
 
-def growth_table(found: Sequence[Growth]) -> str:
+def growth_table(found: Sequence[dict]) -> str:
     """A row per kind of work."""
-
-    def number(name: str):
-        return lambda g: "-" if math.isnan(getattr(g, name)) else f"{getattr(g, name):.2f}"
-
-    names = {"time": "step", "time, last two": "step_at_last", "set up": "setup", "fields": "memory"}
-    columns = [("<work", "{.kind}"), ("meshes", "{.meshes}"), *((heading, number(name)) for heading, name in names.items())]
+    columns = [("<work", "{[kind]}"), ("meshes", "{[meshes]}")]
+    for heading, name in (("time", "step"), ("set up", "setup"), ("fields", "memory")):
+        columns.append((heading, lambda g, name=name: "-" if math.isnan(g[name]) else f"{g[name]:.2f}"))
     return table(found, columns)
 
 

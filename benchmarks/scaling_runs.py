@@ -29,7 +29,7 @@ from taisoft.scene.scene import Scene
 
 from .beam import MARGIN, beam_scene, n_tets
 from .collision_cases import pile_setup, two_cubes
-from .collision_rig import Rig, on_one_thread
+from .collision_runs import Rig, on_one_thread
 from .elasticity import LONGEST_FALL, MAX_STEPS, SAMPLE_SECONDS
 from .kinds import watching
 from .runner import clock, repeated, timed, warm_up

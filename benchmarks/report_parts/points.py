@@ -19,7 +19,7 @@ from taisoft.mesh.sdf import SdfGrid
 
 from ..charts import Panel
 from ..collision_cases import Setup, cubes_setup, pile_setup
-from ..collision_rig import Rig, on_one_thread
+from ..collision_runs import Rig, on_one_thread
 from ..document import exponent, ms, table, timed_cells
 from ..kinds import POINTS, watching
 from ..runner import clock, repeated

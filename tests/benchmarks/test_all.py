@@ -25,7 +25,6 @@ import pytest
 import taisoft as ts
 from benchmarks import (
     collision,
-    collision_runs,
     contact,
     contact_runs,
     elasticity,
@@ -62,7 +61,6 @@ def replace(patch: pytest.MonkeyPatch, module, **values) -> None:
 def collision_small(patch, folder):
     replace(patch, collision, PILES=(1,), REPORT=REPORT[1:2], SHEET=REPORT[1], GEOMETRIES=("proximity",), TREES=("bvh 6",))
     replace(patch, collision, CUBES=(2,), SWEPT=(2,), RATIOS=(1.0, 2.0), QUICK_FRAMES=2)
-    replace(patch, collision_runs, TREES=("bvh 6",))
 
 
 def collision_check(n):

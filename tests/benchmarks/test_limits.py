@@ -80,10 +80,8 @@ def work(kind="implicit", tets=1000, seconds=1.0, **more) -> Work:
 def test_exponents_of_scaling():
     rows = [work(tets=n, seconds=1e-9 * n**1.25) for n in (1000, 4000, 64_000)]
     found = scaling.growths([*rows, work("search"), work("search", samples=[], failure="no")])
-    assert [g.kind for g in found] == ["implicit", "search"] and found[0].meshes == 3 and math.isnan(found[1].step)
-    assert (found[0].step, found[0].step_at_last, found[0].setup, found[0].memory) == pytest.approx((1.25, 1.25, 1, 1))
-    (bent,) = scaling.growths([work(tets=n, seconds=s) for n, s in ((1000, 1.0), (2000, 2.0), (4000, 8.0))])
-    assert bent.step_at_last == pytest.approx(2) and 1 < bent.step < 2
+    assert [g["kind"] for g in found] == ["implicit", "search"] and found[0]["meshes"] == 3 and math.isnan(found[1]["step"])
+    assert [found[0][name] for name in ("step", "setup", "memory")] == pytest.approx([1.25, 1, 1])
     made_up = [Copy("a", 1, 5.0), Copy("b", 1, 7.0), Copy("a", 4, 20.0)]
     assert copy_rate(made_up, 1) == 7.0 and copy_rate(made_up, 4) == 20.0 and copy_rate(made_up[:2], 4) == 7.0
 
