@@ -34,10 +34,6 @@ class Extent:
     quick: bool
     arch: str
 
-    def of(self, full, quick):
-        """`quick` in a quick run, else `full`."""
-        return quick if self.quick else full
-
 
 @dataclass(frozen=True)
 class Claim:
