@@ -4,11 +4,11 @@ taisoft bench contact [--quick] [--arch cpu|cuda] [--out FILE.json]
 
 Scenes are demos, in f32, and real meshes that fall to the ground: assets/bunny.msh, and those of ../shared/meshes where it is.
 Figure numbers are those of the report, of which `taisoft bench report` judges claims by these numbers. In each frame of an
-explicit run every solver solves the contact problem in turn to a residual of 1e-4, from the impulses of the previous step and
-from zero. Residuals are computed in NumPy. A solve's time includes its colouring and excludes compilation; loops run on one CPU
-thread, or on all if stated. What steps spend is explained in benchmarks/kinds.py. Numbers are medians with their range in
-brackets; spread is the interquartile range over the median. Exit status: 0, or 1 if a limit is not met. --quick has few scenes
-and frames, and no limits. A full run takes about eight minutes on two cores.
+explicit run every solver solves the contact problem in turn to a residual of 1e-4, from the impulses of the previous step.
+Residuals are computed in NumPy. A solve's time includes its colouring and excludes compilation; loops run on one CPU thread,
+those of coloured Gauss-Seidel on plates on all. What steps spend is explained in benchmarks/kinds.py. Numbers are medians with
+their range in brackets; spread is the interquartile range over the median. Exit status: 0, or 1 if a limit is not met. --quick
+has few scenes and frames, and no limits. A full run takes about eight minutes on two cores.
 """
 
 import sys
@@ -19,7 +19,6 @@ import numpy as np
 
 from taisoft.backend.runtime import compile_clock, open_runtime
 from taisoft.machine import load_average, summarise
-from taisoft.output.tables import markdown
 
 from . import contact_problems
 from .contact_colouring import (
@@ -34,8 +33,21 @@ from .contact_colouring import (
     measure_crossover,
 )
 from .contact_colouring import SCENE as COLOURED
-from .contact_runs import COLD, EXPLICIT, GOAL, WARM, Film, Solvers, measure_film, open_demo, to_impulses
-from .contact_steps import Profile, Run, measure_run, measure_steps, open_drop, real_meshes
+from .contact_runs import (
+    EXPLICIT,
+    GOAL,
+    SERIAL,
+    Film,
+    Profile,
+    Run,
+    measure_film,
+    measure_run,
+    measure_steps,
+    open_demo,
+    open_drop,
+    real_meshes,
+    to_impulses,
+)
 from .document import Document, Limit, begin, ms, ranged, table, timed_cells, timed_limit
 from .kinds import KINDS
 from .runner import make_parser, parse_options
@@ -63,7 +75,7 @@ def measure(quick: bool, arch: str, document: Document) -> dict:
     demos = DEMOS[: 1 if quick else None]
     for name in demos:
         with open_demo(name, arch, **EXPLICIT) as sim:
-            found["films"].append(measure_film(name, sim, QUICK_FRAMES if quick else FRAMES, Solvers(threads=not quick)))
+            found["films"].append(measure_film(name, sim, QUICK_FRAMES if quick else FRAMES))
             found["steps"].append(measure_steps(name, sim, QUICK_STEPS if quick else STEPS))
     found["steps"] += _sheet_steps(quick, arch)
     document.add(f"## Explicit steps (figs. 19, 20)\n\n{count_table(found['films'])}\n\n{solver_table(found['films'])}")
@@ -140,28 +152,18 @@ def count_table(films: list[Film]) -> str:
 
 def solver_table(films: list[Film]) -> str:
     """A row per scene and solver: medians over frames, and the worst."""
-    lines = []
-    for f in films:
-        for name in f.solvers:
-            warm, cold = f.of(name), f.of(name, COLD)
-            seconds = [o.median for o in warm]
-            sweeps = ranged([o.sweeps for o in warm]), ranged([o.sweeps for o in cold])
-            times = *timed_cells(seconds), ms(max(seconds)), ms(np.median([o.median for o in cold]))
-            residual = max(o.residual for o in warm + cold)
-            lines.append((f.scene, name, *sweeps, *times, f"{residual:.1e}", f"{f.missed([name])} of {2 * len(warm)}"))
-    headings = (
-        "scene",
-        "solver",
-        f"sweeps {WARM}",
-        COLD,
-        f"ms {WARM}",
-        "spread",
-        "maximum",
-        COLD,
-        "worst residual",
-        "not solved",
+    rows = [(film, solver, found) for film in films for solver, found in film.outcomes.items()]
+    columns = (
+        ("<scene", "{[0].scene}"),
+        ("<solver", "{[1]}"),
+        ("sweeps", lambda row: ranged([o.sweeps for o in row[2]])),
+        ("ms", lambda row: timed_cells(o.median for o in row[2])[0]),
+        ("spread", lambda row: timed_cells(o.median for o in row[2])[1]),
+        ("maximum", lambda row: ms(max(o.median for o in row[2]))),
+        ("worst residual", lambda row: f"{max(o.residual for o in row[2]):.1e}"),
+        ("not solved", lambda row: f"{row[0].missed(row[1])} of {len(row[2])}"),
     )
-    return markdown(headings, lines, left=(0, 1))
+    return table(rows, columns)
 
 
 def run_table(runs: list[Run]) -> str:
@@ -210,7 +212,7 @@ def find_limits(found: dict) -> list[Limit]:
     pile = next((r for r in found["runs"] if r.scene == PILE), None)
     wall = pile.wall / pile.simulated if pile and pile.simulated else np.nan
     bad = np.nan if pile is None else float(pile.status != "ok")
-    missed = sum(f.missed(f.solvers[:1]) for f in found["films"]) if found["films"] else np.nan
+    missed = sum(film.missed(SERIAL) for film in found["films"]) if found["films"] else np.nan
     limits = [
         timed_limit(f"{STEP_SCENE}, explicit, f32: a whole step [ms], median of {t.repeats if t else 0}", t, STEP_LIMIT, 1e3),
         Limit(f"{STEP_SCENE}, explicit: the worst residual of these steps", cost.residual if cost else np.nan, GOAL),

@@ -5,7 +5,7 @@ touch triangles of the other; the upper plate falls, and all nodes have small ra
 of four nodes each.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.sparse as sp
@@ -16,12 +16,12 @@ from taisoft.backend.runtime import Runtime
 from taisoft.contact.colouring import UNCOLOURED, colour_contacts, colour_greedy
 from taisoft.contact.problem import ContactProblem, build_node_problem, fill_rows, find_factors, index_nodes, read_entries
 
-from .contact_runs import COLOURED, SERIAL, THREADED, Outcome, Solvers
+from .contact_runs import COLOURED, SERIAL, Outcome, outcomes
 from .document import crossovers, ms, ranged, table
 from .runner import clock
 
 SEEDS, QUICK_SEEDS = 15, 3  # of random colourings
-ROUNDS = 3  # of solvers and deterministic colourings
+ROUNDS = 3  # of deterministic colourings
 SCENE = "two_cubes_two_boxes"  # that of the report
 REPORT = {SCENE: (286, {"greedy": 95, "random": 125})}  # contacts, colours
 SIZES, QUICK_SIZES = (4, 8, 16, 32, 64, 128, 192), (8, 16)  # cells along a plate
@@ -238,11 +238,11 @@ def measure_crossover(sizes, runtime: Runtime) -> list[Point]:
         arena = FieldArena()
         try:
             p = build_plates(n, runtime, arena)
-            solvers, names = Solvers(threads=True), (SERIAL, COLOURED + (THREADED if p.serial else ""))
+            forms = {SERIAL: p, COLOURED: replace(p, serial=False)}
             start = np.zeros((p.capacity, 3))
-            solvers.outcomes(p, start, 1, names)  # compiles
-            found = solvers.outcomes(p, start, ROUNDS, names)
-            points.append(Point(int(p.count[0]), int(p.count[1]), *(found[name] for name in names)))
+            outcomes(p, forms, start, 1)  # compiles
+            found = outcomes(p, forms, start)
+            points.append(Point(int(p.count[0]), int(p.count[1]), found[SERIAL], found[COLOURED]))
         finally:
             ti.sync()
             arena.release()

@@ -20,13 +20,13 @@ from functools import partial
 import taisoft as ts
 from taisoft.cli.doctor import cuda
 from taisoft.dynamics.schemes import EXPLICIT
-from taisoft.machine import Timing, load_average, summarise
+from taisoft.machine import Timing, summarise
 from taisoft.output.tables import percent, spread_of
 
 from .beam import LAWS, beam_scene, explicit_steps, n_tets
-from .document import Limit, begin, limit_table, load_text, table
+from .document import Limit, begin, table
 from .exact_path import MESHES, SAMPLE
-from .runner import add_arch, add_named_out, make_parser, named_out, timed, warm_up
+from .runner import make_parser, parse_options, timed, warm_up
 from .timed_run import advance
 
 SAMPLE_SECONDS = 0.05  # approximate wall time of a sample
@@ -142,11 +142,8 @@ def cost_limits(costs: Sequence[Cost]) -> list[Limit]:
 def main(argv=None) -> int:
     """Measure and print. Raises OutputError, or SimulationError if the arch is not available."""
     parser = make_parser("elasticity", __doc__)
-    add_arch(parser)
     parser.add_argument("--quick", action="store_true", help="two small meshes, f32")
-    add_named_out(parser)
-    options = parser.parse_args(argv)
-    out = named_out(options, "elasticity")
+    options = parse_options(parser, argv)
     document, numbers = begin("Elasticity: the falling beam")
     device = cuda().removeprefix("yes: ") if options.arch == "cuda" else None
     document.add(f"taisoft on {device or 'one thread of the processor'}")
@@ -157,12 +154,7 @@ def main(argv=None) -> int:
             found = measure_costs(cells, precision, options.arch, QUICK_REPEATS if options.quick else REPEATS)
             document.add(cost_table(found))
             costs += found
-    limits, load = cost_limits(costs), load_average()
-    document.add("## Limits\n\n" + limit_table(limits))
-    document.add(f"Load at the end: {load_text(load)}")
-    if out is not None:
-        numbers |= {"device": device, "arch": options.arch, "quick": options.quick, "load_at_the_end": load}
-        document.write(out, numbers | {"cost": costs, "limits": limits})
+    document.finish(options, numbers | {"device": device, "cost": costs}, cost_limits(costs))
     return 0
 
 

@@ -1,6 +1,6 @@
 """Many runs: the same bits from any number of workers, in any order and after a kill, and how long they take.
 
-taisoft bench many [--quick] [--rounds N] [--out FILE.json]
+taisoft bench many [--quick] [--rounds N] [--out [FILE.json]]
 
 `ts.run_many` of 64 cubes that slide to rest and 200 rollouts of a soft leg with two tendons (`benchmarks/many_cases.py`), each
 with one worker of one thread; with one worker for each core; the latter in another order; with a worker killed in the middle; and
@@ -10,25 +10,24 @@ Exit status: 1 if any SHA-256 differs, or if two or more cores take more than 0.
 """
 
 import argparse
-import json
 import os
 import signal
 import sys
 import tempfile
 import time
 from pathlib import Path
+from statistics import median
 
 import numpy as np
 
 import taisoft as ts
 from taisoft.errors import SimulationError
-from taisoft.machine import THREADS, summarise, usable_cores
-from taisoft.output.tables import markdown
+from taisoft.machine import THREADS, usable_cores
 from taisoft.processes import start_python
 
-from .document import Limit, begin, check_out
+from .document import Limit, begin, table
 from .many_cases import rollout, slide
-from .runner import make_parser, progress
+from .runner import make_parser, parse_options, patched, progress
 
 PARTS = {
     "sliding cubes": (slide, [{"friction": mu, "speed": v} for mu in np.linspace(0.2, 0.9, 8) for v in np.linspace(0.6, 2.0, 8)]),
@@ -109,42 +108,47 @@ def measure(name: str, n: int, rounds: int) -> dict:
     return found
 
 
+def wall_limits(parts: dict[str, dict], quick: bool) -> list[Limit]:
+    """Limits on digests and on what workers gain."""
+    limits = []
+    for name, found in parts.items():
+        limits.append(Limit(f"{name}: different SHA-256", len(set(found["digests"].values())), 1))
+        if not quick and found["workers"] > 1:
+            limits.append(Limit(f"{name}: wall time over that of one worker", ratio(found), RATIO))
+    return limits
+
+
+def ratio(found: dict) -> float:
+    """Wall time with all cores over that of one worker."""
+    return median(found["all"]) / median(found["one"])
+
+
 def main(argv=None) -> int:
     """Measure and judge. Raises SimulationError if a run fails."""
     parser = make_parser("many", __doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help=f"{QUICK_RUNS} runs of each, without a limit on the time")
     parser.add_argument("--rounds", type=int, default=1, metavar="N", help="times that each is timed (default 1)")
-    parser.add_argument("--out", type=Path, metavar="FILE.json", help="write FILE.json and FILE.md too")
     parser.add_argument("--child", nargs=4, help=argparse.SUPPRESS)  # what is killed: part, runs, workers, folder
-    options = parser.parse_args(argv)
+    options = parse_options(parser, argv, arch=False)
     if options.child:
         name, n, workers, folder = options.child
         run(name, int(n), int(workers), out=Path(folder))
         return 0
-    check_out(options.out, ".json")
-    options.arch = "cpu"
-    before = os.environ.get(THREADS)
-    os.environ[THREADS] = "1"
-    try:
+    with patched(os, "environ", os.environ | {THREADS: "1"}):
         document, numbers = begin("Many runs", "one thread for each worker")
         parts = {n: measure(n, QUICK_RUNS if options.quick else len(PARTS[n][1]), max(1, options.rounds)) for n in PARTS}
-    finally:
-        os.environ.pop(THREADS) if before is None else os.environ.update({THREADS: before})
-    rows, limits = [], []
-    for name, found in parts.items():
-        one, several = summarise(found["one"]), summarise(found["all"])
-        ratio = several.median / one.median
-        times = (f"{one.median:.1f}", f"{several.median:.1f}")
-        rows.append((name, str(found["runs"]), *times, str(found["workers"]), f"{ratio:.2f}"))
-        digests = set(found["digests"].values())
-        limits.append(Limit(f"{name}: different SHA-256", len(digests), 1))
-        if not options.quick and found["workers"] > 1:
-            limits.append(Limit(f"{name}: wall time over that of one worker", ratio, RATIO))
-    headings = ("runs of", "number", "one worker [s]", "all cores [s]", "workers", "ratio")
-    document.add("## Wall times\n\n" + markdown(headings, rows, left=(0,)))
+    columns = (
+        ("<runs of", "{[0]}"),
+        ("number", "{[1][runs]}"),
+        ("one worker [s]", lambda part: f"{median(part[1]['one']):.1f}"),
+        ("all cores [s]", lambda part: f"{median(part[1]['all']):.1f}"),
+        ("workers", "{[1][workers]}"),
+        ("ratio", lambda part: f"{ratio(part[1]):.2f}"),
+    )
+    document.add("## Wall times\n\n" + table(parts.items(), columns))
     shas = [(name, how, sha) for name, found in parts.items() for how, sha in found["digests"].items()]
-    document.add("## Results\n\n" + markdown(("runs of", "how", "SHA-256 of all results"), shas, left=(0, 1, 2)))
-    return document.finish(options, numbers | {"parts": json.loads(json.dumps(parts))}, limits)
+    document.add("## Results\n\n" + table(shas, (("<runs of", "{[0]}"), ("<how", "{[1]}"), ("<SHA-256 of all results", "{[2]}"))))
+    return document.finish(options, numbers | {"parts": parts}, wall_limits(parts, options.quick))
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """Start-up: waiting time before the first steps, with and without cached kernels.
 
-taisoft bench startup [--quick] [--baseline FOLDER] [--out FILE.json]
+taisoft bench startup [--quick] [--baseline FOLDER] [--out [FILE.json]]
 
 A beam of 540 tets in explicit steps, and cubes of 320 tets in implicit steps with contacts, one on a block, one on a half-space
 ("plane"), each to its tenth step: cold (a new process, an empty kernel cache), warm (a new process, the same cache), and warm
@@ -26,8 +26,8 @@ from pathlib import Path
 import numpy as np
 
 from . import startup_child
-from .document import Limit, begin, check_out, table
-from .runner import HERE, make_parser, progress, run_python
+from .document import Limit, begin, table
+from .runner import HERE, make_parser, parse_options, progress, run_python
 from .startup_child import CALLS, CHANGES, COUNTS, SPEED, WAITING
 
 SIZES = {"beam": (3, 4, 5, 6), "cube": (4, 5, 6, 7), "plane": (4, 5, 6, 7)}  # cells, and those of another size in each round
@@ -156,9 +156,7 @@ def main(argv=None) -> int:
     parser = make_parser("startup", __doc__)
     parser.add_argument("--quick", action="store_true", help="one round, small meshes, two simulators for memory, no limit")
     parser.add_argument("--baseline", type=Path, metavar="FOLDER", help="another version of taisoft to compare with")
-    parser.add_argument("--out", type=Path, metavar="FILE.json", help="write FILE.json and FILE.md too")
-    options = parser.parse_args(argv)
-    check_out(options.out, ".json")
+    options = parse_options(parser, argv, arch=False)
     document, numbers = begin("Start-up", "arch cpu")
     with tempfile.TemporaryDirectory() as caches:
         folders = {label: folder for label, folder in (("this version", HERE), ("baseline", options.baseline)) if folder}

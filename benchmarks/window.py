@@ -1,6 +1,6 @@
 """Live window: speed over real time, pictures per second, and latency of drags, for demos with contacts.
 
-taisoft bench window [--quick] [--only NAME,...] [--out FILE.json]
+taisoft bench window [--quick] [--only NAME,...] [--out [FILE.json]]
 
 Every demo with contacts and up to 5,000 tets runs in a window on a virtual display (Xvfb), drawn by the Vulkan driver of this
 machine, which may be one in software. First a run without a window, which also compiles, is timed; then the same time is run in
@@ -16,7 +16,6 @@ import itertools
 import subprocess
 import sys
 import time
-from pathlib import Path
 from statistics import median
 
 import numpy as np
@@ -32,9 +31,9 @@ from taisoft.view.screen import MESSAGES, PANEL, SIZE, free_part
 from taisoft.view.window import WindowProcess
 
 from .children import in_child
-from .document import Limit, begin, check_out, table
+from .document import Limit, begin, table
 from .kinds import JOINED, watching
-from .runner import make_parser, progress, without_warnings
+from .runner import make_parser, parse_options, progress, without_warnings
 from .virtual_display import VirtualDisplay
 
 MAX_TETS = 5000
@@ -256,9 +255,7 @@ def main(argv=None) -> int:
     parser = make_parser("window", __doc__)
     parser.add_argument("--quick", action="store_true", help="one demo, no limits")
     parser.add_argument("--only", metavar="NAME,...", help="some demos")
-    parser.add_argument("--out", type=Path, metavar="FILE.json", help="write FILE.json and FILE.md too")
-    options = parser.parse_args(argv)
-    check_out(options.out, ".json")
+    options = parse_options(parser, argv, arch=False)
     display = VirtualDisplay()
     try:
         document, numbers = begin("Live window", "arch cpu", "on a virtual display")

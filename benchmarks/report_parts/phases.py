@@ -8,8 +8,7 @@ from taisoft.output.tables import percent
 
 from ..charts import Panel
 from ..contact import GEOMETRIES, SHEET
-from ..contact_runs import EXPLICIT
-from ..contact_steps import Profile
+from ..contact_runs import EXPLICIT, Profile
 from ..kinds import CANDIDATES, IN_SEARCH, KINDS, POINTS, REDUCTION
 from .page import Claim, Part, plot_png, restored
 
