@@ -2,7 +2,9 @@
 
 from collections.abc import Callable, Iterator
 from contextlib import closing
+from itertools import product
 from time import perf_counter
+from types import SimpleNamespace
 
 import numpy as np
 
@@ -20,9 +22,9 @@ from .programs.session import Setting
 from .runner import patched, print_result, warm_up
 from .scaling_runs import cubes_on_ground
 from .timed_run import advance
-from .works.evaluation import evaluate
 from .works.references import MUJOCO, TAISOFT
-from .works.scenes import WORKS, Work
+from .works.runs import Row, measure
+from .works.scenes import WORKS
 
 EXPLICIT_STEPS = {"W1 12x3x3": 3, "W1 24x6x6": 5, "W1 48x12x12": 11, "W2": 3, "W3": 2, "W4": 19}  # stable steps in 10 ms
 TIMED_STEPS, IMPLICIT_STEPS = 200, 3
@@ -41,36 +43,25 @@ def run_job(name: str, arch: str, quick: bool) -> None:
 
 def works(arch: str, quick: bool) -> Iterator[dict]:
     """Time and error of the works, explicit and implicit, on `arch` and on the CPU of the same machine."""
-    chosen = [work for work in WORKS if work.key in (("W1 12x3x3",) if quick else EXPLICIT_STEPS)]
-    for work in chosen:
-        model = MUJOCO if work.cells is not None else TAISOFT
-        for method, steps in (("velocity_verlet", EXPLICIT_STEPS[work.key]), ("implicit_euler", 1)):
-            for where in dict.fromkeys((arch, "cpu")):
-                setting = Setting(own.NAME, model, method, steps, {"precision": "f32", "arch": where})
-                named = {"work": work.key, "tets": work.tets, "setting": f"{method}, {1e3 * setting.dt:.3g} ms", "arch": where}
-                yield named | _timed(work, setting)
+    for work in WORKS:
+        if work.key in (("W1 12x3x3",) if quick else EXPLICIT_STEPS):
+            model = MUJOCO if work.cells is not None else TAISOFT
+            methods = (("velocity_verlet", EXPLICIT_STEPS[work.key]), ("implicit_euler", 1))
+            kinds = product(methods, dict.fromkeys((arch, "cpu")))
+            settings = [Setting(own.NAME, model, *method, {"precision": "f32", "arch": where}) for method, where in kinds]
+            program = SimpleNamespace(NAME=own.NAME, Run=own.Run, settings=lambda _work, _arch, settings=settings: settings)
+            yield from map(_work_numbers, measure(work, [program], 1))
 
 
-def _timed(work: Work, setting: Setting) -> dict:
+def _work_numbers(row: Row) -> dict:
     """Time, error and verdict of one setting, or its failure."""
-    try:
-        session = own.Run(work, setting)
-        try:
-            positions, _ = session.run(follow=True)
-            _, seconds = session.run(follow=False)
-        finally:
-            session.close()
-        verdict = evaluate(work, setting.model, positions)
-    except TaisoftError as error:
-        return {"failure": str(error)}
-    return {
-        "seconds": seconds / work.seconds,
-        "build_seconds": session.build_seconds,
-        "error": verdict.error,
-        "stands": verdict.stands,
-        "inverted": verdict.inverted,
-        "unconverged": session.unconverged,
-    }
+    setting = row.setting
+    named = {"work": row.work.key, "tets": row.work.tets, "setting": f"{setting.method}, {1e3 * setting.dt:.3g} ms"}
+    named |= {"arch": setting.options["arch"]}
+    if row.failure:
+        return named | {"failure": row.failure}
+    found = {name: getattr(row.verdict, name) for name in ("error", "stands", "inverted")}
+    return named | found | {"seconds": row.timing.median, "build_seconds": row.build_seconds[0], "unconverged": row.unconverged}
 
 
 def sweeps(arch: str, quick: bool) -> Iterator[dict]:
