@@ -5,10 +5,10 @@ taisoft bench report [--quick] [--arch cpu|cuda] [--only NAME] [--out DIR]
 The page is DIR/README.md, with pictures and all numbers (report.json) beside it. Scenes are ours, since the report gives few
 sizes and neither its machine nor its materials. The search and the contact solve are judged by the numbers of `taisoft bench
 collision` and `taisoft bench contact` in benchmarks/results, which are run first if they are not there; the rest is measured
-here. The numbers decide whether a claim holds; a part agrees, disagrees or partly agrees. Times are medians without compilation;
-spread is the interquartile range over the median. A second run into the same folder lists the times that differ by more than the
-spreads. Exit status: 0, or 1 if a part could not be measured; verdicts do not matter. --quick has fewer scenes, sizes and rounds,
-and measures everything; it and --only write files only with --out. A full run takes about six minutes on two cores.
+here. The numbers decide whether a claim holds; a part agrees, disagrees or partly agrees. Times are medians without
+compilation; spread is the interquartile range over the median. Exit status: 0, or 1 if a part could not be measured; verdicts
+do not matter. --quick has fewer scenes, sizes and rounds, and measures everything; it and --only write files only with --out. A
+full run takes about six minutes on two cores.
 """
 
 import os
@@ -26,7 +26,7 @@ from taisoft.output.files import make_folder
 from taisoft.output.report import json_text
 from taisoft.output.tables import require_matplotlib
 
-from .document import again_text, default_out, earlier_numbers, header, load_text, plain
+from .document import default_out, header, load_text
 from .report_parts import bound, demos, phases, points, search, solvers
 from .report_parts.page import Extent, Part, numbers_of, part_text, short_text, summary_table
 from .runner import add_arch, make_parser
@@ -69,7 +69,7 @@ def measure_part(name: str, extent: Extent) -> Part:
     return part
 
 
-def page_text(head: str, numbers: dict, parts: list[Part], again: str) -> str:
+def page_text(head: str, numbers: dict, parts: list[Part]) -> str:
     """The whole page."""
     opening = (
         f"{head}\nload {load_text(numbers['load_at_the_end'])} at the end; {numbers['seconds']:.0f} s in all, "
@@ -78,18 +78,16 @@ def page_text(head: str, numbers: dict, parts: list[Part], again: str) -> str:
         "report`; nothing on this page is written by hand. Claims are the report's in our words; the numbers decide whether they "
         "hold. Times are medians; spread is the interquartile range over the median."
     )
-    return "\n\n".join([opening, summary_table(parts), *map(part_text, parts), short_text(parts), again]) + "\n"
+    return "\n\n".join([opening, summary_table(parts), *map(part_text, parts), short_text(parts)]) + "\n"
 
 
 def write(folder: Path, head: str, numbers: dict, parts: list[Part]) -> None:
     """Write the page, its pictures and its numbers. Raises OutputError."""
-    times = {f"{part.name}: {name}": t for part in parts for name, t in part.times.items()}
-    page = page_text(head, numbers, parts, again_text(earlier_numbers(folder / NUMBERS), times, numbers))
     for part in parts:
         for name, data in part.pictures.items():
             write_bytes(folder / name, data)
-    write_bytes(folder / PAGE, page.encode())
-    numbers = numbers | {"times": plain(times), "parts": [part.record() for part in parts]}
+    write_bytes(folder / PAGE, page_text(head, numbers, parts).encode())
+    numbers = numbers | {"parts": [part.record() for part in parts]}
     write_bytes(folder / NUMBERS, json_text(numbers).encode())
 
 

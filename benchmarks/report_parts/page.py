@@ -16,8 +16,6 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from taisoft.machine import Timing
-
 from ..charts import Panel, figure_of
 from ..document import default_out, earlier_numbers, plain, table
 
@@ -50,7 +48,7 @@ class Claim:
 
 @dataclass
 class Part:
-    """A measured experiment. where: in the report; method: what was run; times: compared with those of a second run.
+    """A measured experiment. where: in the report; method: what was run.
 
     pictures: file name -> PNG; short: differences from the report and omissions; failure: why it could not be measured, or empty.
     """
@@ -62,7 +60,6 @@ class Part:
     claims: list[Claim] = field(default_factory=list)
     tables: list[str] = field(default_factory=list)
     pictures: dict[str, bytes] = field(default_factory=dict)
-    times: dict[str, Timing] = field(default_factory=dict)
     short: list[str] = field(default_factory=list)
     seconds: float = 0.0
     failure: str = ""

@@ -14,7 +14,6 @@ import numpy as np
 from taisoft.backend.runtime import Runtime, open_runtime, threads
 from taisoft.collision.colliders import body_grid
 from taisoft.collision.surface import SERIAL_BELOW
-from taisoft.machine import summarise
 from taisoft.mesh.sdf import SdfGrid
 
 from ..charts import Panel
@@ -249,6 +248,4 @@ def measure(extent: Extent) -> Part:
         part.short.append(f"the report has a GPU, this run {where} of a processor; `--arch cuda` runs it on a GPU.")
     if left := [p.setup for p in many if not p.plain]:
         part.short.append(f"the interpreted loop was left out for {', '.join(left)}, so the ratios end below.")
-    part.times = {f"{p.setup}, {where}": summarise(p.seconds) for p in many}
-    part.times |= {f"{p.setup}, one thread": summarise(p.seconds) for p in one}
     return part
