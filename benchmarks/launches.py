@@ -22,7 +22,7 @@ from .children import in_child
 from .document import Limit, begin, table
 from .runner import clock, make_parser, parse_options, progress, without_warnings
 
-ROUNDS = 5
+ROUNDS, QUICK_ROUNDS = 5, 1
 LAUNCH = 1.5  # largest time of a launch [us]
 ARRAYS = 1, 16, 64, 200
 STRETCHES = 15
@@ -129,7 +129,7 @@ def main(argv=None) -> int:
     options = parse_options(parser, argv)
     document, numbers = begin("Launches", f"arch {options.arch}")
     rounds = []
-    for k in range(1 if options.quick else ROUNDS):
+    for k in range(QUICK_ROUNDS if options.quick else ROUNDS):
         progress(f"round {k + 1}")
         rounds.append(in_child("launches", measure, options.arch, options.quick))
     document.add("## A launch\n\n" + range_table(rounds, "launches", "arrays", 2))

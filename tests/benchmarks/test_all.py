@@ -229,7 +229,7 @@ QUICK = ("--quick",)
 def launches_small(patch: pytest.MonkeyPatch, folder: Path) -> None:
     """Made-up times."""
     rounds = iter([{"launches": {"200": us}, "steps": {"resting": 100.0 * us}} for us in (1.0, 3.0, 2.0)])
-    replace(patch, launches, ROUNDS=3, in_child=lambda *_: next(rounds), find_limits=lambda rounds: [])
+    replace(patch, launches, QUICK_ROUNDS=3, in_child=lambda *_: next(rounds))
 
 
 BEAM = ("--only", "hanging beam")
@@ -251,7 +251,7 @@ RUNS = {
     ),
     "hard": Small(("--only", "G1", "--quick"), ("# Hard cases", "**1 of 1 variants are solved.**"), hard_small),
     "ipc": Small(("--quick", "--only", "twisted_mat"), ("| twisted mat | 800 | 1,805 | 0.04 | 0.08 of 25 (2) |",), ipc_small),
-    "launches": Small((), ("| 200 | 2.00 (1.00 to 3.00) |", "| resting | 200 (100 to 300) |"), launches_small),
+    "launches": Small(QUICK, ("| 200 | 2.00 (1.00 to 3.00) |", "| resting | 200 (100 to 300) |"), launches_small),
     "laws": Small(QUICK, ("| psi of SNH | stable_neo_hookean |", "| psi of F | st_venant_kirchhoff |"), laws_small),
     "many": Small(QUICK, ("| sums | 6 |", "| killed and called again |", "| met |"), many_small, many_check),
     "order": Small(QUICK, ("| SNH | 1 | 1 | 11x2x2 | 220 | 108 | -2.26758 | 16.3 |",), order_small),
