@@ -23,7 +23,6 @@ from taisoft.output.tables import markdown, percent, spread_of
 
 RESULTS = Path(__file__).resolve().parent / "results"
 DIGITS = 8  # of stored numbers
-COMPARABLE = ("processor", "cores", "arch", "quick")  # runs are compared only if these agree
 
 
 # --- the page -----------------------------------------------------------------------------------------------------------
@@ -256,35 +255,3 @@ def earlier_numbers(path: Path | None) -> dict | None:
         return None if path is None else json.loads(path.read_text())
     except (OSError, ValueError):
         return None
-
-
-def agrees(one: dict, two: dict) -> bool:
-    """Whether two timings, as plain data, agree within the sum of their spreads."""
-    return abs(one["median"] - two["median"]) <= one["spread"] * one["median"] + two["spread"] * two["median"]
-
-
-def again_text(earlier: dict | None, times: dict[str, Timing], numbers: dict) -> str:
-    """Compare times with those of an earlier run with the same output file. earlier: its numbers or None."""
-    head = "## Beside an earlier run\n\n"
-    if earlier is None:
-        return head + "There was no earlier run here."
-    differing = [name for name in COMPARABLE if earlier.get(name) != numbers.get(name)]
-    if differing:
-        return head + f"The earlier run here had another {' and '.join(differing)}."
-    before = earlier.get("times", {})
-    pairs = [(name, before[name], now) for name, now in plain(times).items() if name in before]
-    rows = [
-        (
-            name,
-            ms(was["median"]),
-            percent(was["spread"]),
-            ms(now["median"]),
-            percent(now["spread"]),
-            f"{now['median'] / was['median']:.2f}",
-        )
-        for name, was, now in pairs
-        if not agrees(was, now)
-    ]
-    text = f"{len(pairs) - len(rows)} of {len(pairs)} times agree with those of {earlier['date']} within the spreads of both."
-    headings = ("time", "then [ms]", "spread", "now [ms]", "spread", "now / then")
-    return head + text + ("\n\nThe others:\n\n" + markdown(headings, rows, left=(0,)) if rows else "")

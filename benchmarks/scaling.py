@@ -23,7 +23,7 @@ from taisoft.output.tables import percent, spread_of
 
 from .charts import Panel, write_plot
 from .children import in_child
-from .document import again_text, begin, earlier_numbers, exponent, table
+from .document import begin, exponent, table
 from .runner import make_parser, parse_options, progress
 from .scaling_bytes import GROUPS, Copy, copy_rate, measure_copy
 from .scaling_runs import KINDS, ON_ONE, PRECISION, Row, measure
@@ -233,7 +233,6 @@ def main(argv=None) -> int:
     document.add("## Exponents over the tets\n\n" + growth_table(found))
     numbers |= {"arch": options.arch, "precision": PRECISION, "quick": options.quick}
     times = {f"{row.kind}, {row.tets:,} tets": row.timing for row in measured(rows)}
-    document.add(again_text(earlier_numbers(options.out), times, numbers))
     numbers |= {"rows": rows, "copies": copies, "exponents": found, "times": times}
     document.finish(options, numbers, (), lambda path: draw(rows, copies, path))
     return 1 if any(row.failure for row in rows) else 0

@@ -4,8 +4,6 @@ T: the explicit limit, large implicit steps, a fast impact, a stiff cube. L: a f
 that is stopped and goes on in another process.
 """
 
-import subprocess
-import sys
 import tempfile
 import warnings
 from pathlib import Path
@@ -17,6 +15,7 @@ from taisoft.fem.reference import lumped_mass
 from taisoft.output.report import peak_memory
 from taisoft.scene.key_frames import KeyFrames
 
+from ..children import in_child
 from ..reference_cases.record import face
 from .case import (
     ANALYTIC,
@@ -191,7 +190,7 @@ def resume(session: Session) -> dict[str, float]:
 
         session.run_steps(sim, 200, look)
         touching = session.reports[99].n_contacts
-        resumed = frames_in_child(saved)
+        resumed = np.array(in_child("the resumed run", frames_from, str(saved)))
     different = [k for k, (a, b) in enumerate(zip(frames, resumed)) if not np.array_equal(a, b)]
     return {
         "contacts when it was stopped": touching,
@@ -201,29 +200,14 @@ def resume(session: Session) -> dict[str, float]:
     }
 
 
-CHILD_CODE = """
-import sys
-import numpy as np
-from taisoft.cli.scene_file import load_shipped
-np.save(sys.argv[2], load_shipped("benchmarks", "hard_cases.time_step").frames_from(sys.argv[1]))
-"""
-
-
-def frames_in_child(saved: Path) -> np.ndarray:
-    """`frames_from` in a process of its own. Raises CalledProcessError where that fails."""
-    frames = saved.with_name("frames.npy")
-    subprocess.run([sys.executable, "-c", CHILD_CODE, saved, frames], check=True)
-    return np.load(frames)
-
-
-def frames_from(saved: str) -> np.ndarray:
-    """(100,2,n,3) positions [m] and velocities [m/s] of the 100 steps after a checkpoint of L3."""
+def frames_from(saved: str) -> list:
+    """Positions [m] and velocities [m/s], two lists of the nodes', of each of the 100 steps after a checkpoint of L3."""
     with ts.Simulator.load_checkpoint(saved, stack_scene(None)) as sim:
         found = []
         for _ in range(100):
             sim.step()
-            found.append(np.stack([sim.positions(), sim.velocities()]))
-    return np.array(found)
+            found.append([sim.positions().tolist(), sim.velocities().tolist()])
+    return found
 
 
 STABLE = Must(OK, "2 ms are below the limit of 2.24 ms, so that the motion stays bounded")

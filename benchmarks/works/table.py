@@ -2,9 +2,10 @@
 
 from pathlib import Path
 
-from taisoft.output.tables import markdown, percent, require_matplotlib, save, spread_of, ticks
+from taisoft.output.tables import markdown, percent, spread_of
 from taisoft.study.results import front
 
+from ..charts import Panel, write_plot
 from ..document import Limit
 from ..programs import own
 from .runs import Row, fastest_standing, fastest_within, time_ratio
@@ -13,7 +14,6 @@ LEVELS = (1e-2, 1e-3, 1e-4, 1e-5)  # errors at which W1 is compared
 FASTER = 4.0  # times the best peer, on W1 at equal error
 W2_ERROR, W2_SECONDS = 0.005, 0.4
 STYLES = {"taisoft": ("#d55e00", "o"), "MuJoCo": ("#0072b2", "s"), "PyBullet": ("#009e73", "^"), "Newton": ("#cc79a7", "D")}
-COLUMNS, PANEL = 3, (4.2, 3.4)  # panels in a row, their size in inches
 
 
 def run_table(rows: list[Row]) -> str:
@@ -138,40 +138,19 @@ def implicit_table(works: list[list[Row]]) -> str:
 
 def draw(works: list[list[Row]], path: Path) -> None:
     """Write a PNG of error against time, a panel per work with an exact path. Raises OutputError."""
-    works = [rows for rows in works if rows[0].work.kind == "path" and any(row.timing for row in rows)]
-    if not works:
-        return
-    require_matplotlib()
-    from matplotlib import pyplot
-
-    lines = -(-len(works) // COLUMNS)
-    figure, grid = pyplot.subplots(
-        lines, COLUMNS, figsize=(PANEL[0] * COLUMNS, PANEL[1] * lines + 0.4), squeeze=False, layout="constrained"
-    )
-    for panel in grid.flat[len(works) :]:
-        panel.set_visible(False)
-    drawn: dict = {}
-    for panel, rows in zip(grid.flat, works):
-        drawn |= _panel(panel, rows)
-    figure.legend(drawn.values(), drawn.keys(), loc="outside upper center", ncols=len(drawn), frameon=False)
-    figure.supxlabel("wall time of a simulated second [s], median")
-    figure.supylabel("error [%]")
-    save(figure, path, dpi=100)
-
-
-def _panel(panel, rows: list[Row]) -> dict:
-    timed = [row for row in rows if row.timing is not None]
-    points = [(row.timing.median, 100 * row.claimed) for row in timed]
-    handles = {}
-    for name, (colour, marker) in STYLES.items():
-        own = [p for p, row in zip(points, timed) if row.setting.program == name]
-        if own:
-            (handles[name],) = panel.plot(*zip(*own), marker, color=colour, ms=5)
-    best = [points[k] for k in front(points)]
-    (handles["front"],) = panel.step(*zip(*best), where="post", color="#888888", lw=1.0, ls="--")
-    panel.set(xscale="log", yscale="log", title=f"{rows[0].work.key}, {rows[0].work.tets:,} tets")
-    for axis, values in zip((panel.xaxis, panel.yaxis), zip(*points)):
-        ticks(axis, max(values) / min(values))
-    panel.grid(True, which="major", color="#eeeeee")
-    panel.set_axisbelow(True)
-    return handles
+    panels = []
+    for rows in works:
+        timed = [row for row in rows if row.timing is not None]
+        if rows[0].work.kind != "path" or not timed:
+            continue
+        title = f"{rows[0].work.key}, {rows[0].work.tets:,} tets"
+        panels.append(Panel(title, "wall time of a simulated second [s], median", "error [%]", "xy"))
+        points = [(row.timing.median, 100 * row.claimed) for row in timed]
+        for name, (colour, marker) in STYLES.items():
+            own = [point for point, row in zip(points, timed) if row.setting.program == name]
+            if own:
+                panels[-1].curve(*zip(*own), name, colour, "o", marker=marker)
+        best = [points[k] for k in front(points)]
+        panels[-1].curve(*zip(*best), "front", "#888888", "--", drawstyle="steps-post", lw=1.0)
+    if panels:
+        write_plot(path, panels)

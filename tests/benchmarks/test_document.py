@@ -1,7 +1,6 @@
 """What benchmarks share: pages, limits, options, stopwatches, stored runs, the collection of figures and the manual's tables:
 
 * a limit is met or not, nan never meets it, and a distance within the spread is marked; exponents and crossovers are exact;
-* times are compared with those of an earlier run of the same machine and extent, within both spreads;
 * output that cannot be written and unknown names are refused by every benchmark before anything is measured;
 * stored arrays are used until code or file change; `bench figures` runs every benchmark with files of its own;
 * the page of `bench report` shows the verdicts that follow from claims;
@@ -18,7 +17,7 @@ import numpy as np
 import pytest
 
 from benchmarks import document, figures, manual, report, tolerance
-from benchmarks.document import Limit, agrees, crossovers, exponent
+from benchmarks.document import Limit, crossovers, exponent
 from benchmarks.manual import BLOCK, TABLES, filled, newest, pages
 from benchmarks.report_parts.page import AGREE, DISAGREE, MISSING, PARTLY, Claim, Part, small_png, verdict_of
 from taisoft.cli.scene_file import shipped_files
@@ -54,11 +53,6 @@ def test_exponents_and_crossovers():
     assert crossovers(tets, [2.0, 2.0, 2.0], [1.0, 1.0, 1.0]) == []
     assert crossovers(tets, [2.0, 1.0, 1.0], [1.0, 2.0, 4.0]) == [pytest.approx(10**2.5)]
     assert len(crossovers(tets, [2.0, 1.0, 2.0], [1.0, 2.0, 1.0])) == 2
-
-
-def test_times_agree_within_both_spreads():
-    one, two = ({"median": m, "spread": s} for m, s in ((1.0, 0.1), (1.25, 0.1)))
-    assert not agrees(one, two) and agrees(one, two | {"spread": 0.2})
 
 
 @pytest.mark.filterwarnings("ignore::UserWarning")
