@@ -16,9 +16,10 @@ from taisoft.view.colouring import BACKGROUND
 from taisoft.view.drawn import DrawnScene, DrawnState
 from taisoft.view.ggui import Canvas
 from taisoft.view.keys import ACTIONS
+from taisoft.view.layers import IN_FRONT
 from taisoft.view.panel import Panel, Requests, wrapped
 from taisoft.view.picking import MouseDrag, pick
-from taisoft.view.scene_view import IN_FRONT, SceneView
+from taisoft.view.scene_view import SceneView
 from taisoft.view.timing import Note, Timing
 from taisoft.view.window_shadow import ShadowMesh
 

@@ -13,12 +13,12 @@ from taisoft.errors import OutputError
 from taisoft.frames import dt_sentence, fit_dt
 from taisoft.output.files import Observer
 from taisoft.records import RunReport, StepReport
+from taisoft.view.choices import IN_WINDOW
 from taisoft.view.controls import touching_pairs
 from taisoft.view.ggui import display_missing, vulkan_missing
 from taisoft.view.link import Viewer
 from taisoft.view.live import LiveRun
 from taisoft.view.sampling import Sampler
-from taisoft.view.scene_view import IN_WINDOW
 
 FAILURE = "cannot open a window"
 START_SECONDS = 60.0  # in which the window must open

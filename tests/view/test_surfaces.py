@@ -9,9 +9,10 @@ from taisoft.output.viewpoint import Viewpoint
 from taisoft.scene.key_frames import KeyFrames
 from taisoft.view.drawn import DrawnScene
 from taisoft.view.ground import Square, finite_points
+from taisoft.view.layers import Layers
 from taisoft.view.offscreen import Offscreen
 from taisoft.view.picking import MouseDrag, nearest_hit, pick
-from taisoft.view.scene_view import MARKER_COLOUR, Layers, Surfaces
+from taisoft.view.scene_view import MARKER_COLOUR, Surfaces
 from taisoft.view.shadow import Shadows, blurred
 from taisoft.view.window_shadow import ShadowMesh
 from tests.view.drawing import sampled
