@@ -18,8 +18,8 @@ import scipy.sparse as sp
 from taisoft.attributes import thawed
 from taisoft.errors import SceneError
 from taisoft.mesh import nodes as mesh_nodes
+from taisoft.mesh.distances import are_inside, distances
 from taisoft.mesh.quality import volume_moments
-from taisoft.mesh.solids import are_inside, distances
 from taisoft.mesh.surface_mesh import SurfaceMesh, as_surface
 from taisoft.mesh.tet_mesh import TetMesh
 from taisoft.scene import checks

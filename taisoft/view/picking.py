@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from taisoft.mesh.solids import ray_hits
+from taisoft.mesh.distances import ray_hits
 from taisoft.output.viewpoint import Viewpoint
 from taisoft.view.drawn import DrawnState
 

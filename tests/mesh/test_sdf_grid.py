@@ -7,9 +7,9 @@ import pytest
 
 from taisoft.errors import MeshError
 from taisoft.mesh import sdf as module
+from taisoft.mesh.distances import distances, winding_numbers
 from taisoft.mesh.sdf import cache_folder, cached_sdf_grid, sdf_grid
 from taisoft.mesh.shapes import ball_mesh, box_mesh, sheet_mesh
-from taisoft.mesh.solids import distances, winding_numbers
 from taisoft.mesh.tet_mesh import TetMesh
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import taisoft as ts
-from taisoft.mesh.solids import ray_hits
+from taisoft.mesh.distances import ray_hits
 from taisoft.output.smoothing import smoothing_groups, vertex_normals
 from taisoft.output.viewpoint import Viewpoint
 from taisoft.scene.key_frames import KeyFrames
