@@ -8,8 +8,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from taisoft.output.appearance import ObstacleSurface, ShownBodies, body_colours, obstacle_colour, obstacle_surfaces, subdivide
-from taisoft.output.smoothing import smoothing_groups, unit, vertex_normals
+from taisoft.output.appearance import ObstacleSurface, ShownBodies, body_colours, capsule, obstacle_colour, obstacle_surfaces
+from taisoft.output.smoothing import smoothing_groups, vertex_normals
 from taisoft.output.viewpoint import MAX_WIDENING, WHOLE, Viewpoint, camera_viewpoint
 from taisoft.scene import checks
 from taisoft.scene.look import Camera, check_follow
@@ -21,6 +21,7 @@ from taisoft.view.layers import Layers
 from taisoft.view.sampling import Sampler
 
 MARKER_COLOUR = np.array([0.20, 0.22, 0.26])  # sRGB
+MARKER_FACETS = (12, 3)  # around its axis, and from the equator to a pole
 MARKER_SIZE = 0.16  # radius in units of the mean edge length of the body's surface
 
 
@@ -153,7 +154,7 @@ class _BodySurface:
         nodes, corners = smoothing_groups(rest, surface)
         edges = rest[surface] - rest[np.roll(surface, 1, axis=1)]
         marked = body.fixed
-        ball, ball_triangles = _coarse_ball()
+        ball, ball_triangles = capsule(0.0, 1.0, *MARKER_FACETS)
         counts = len(nodes), len(ball) * len(marked)
         starts = len(nodes) + len(ball) * np.arange(len(marked))
         markers = (starts[:, None, None] + ball_triangles).reshape(-1, 3)
@@ -197,15 +198,3 @@ class _RigidSurface:
         back_facing = np.einsum("ti,ti->t", np.cross(b - a, c - a), eye - a) <= 0
         corners[back_facing] = a[back_facing, None]  # triangles of zero area are invisible
         return corners.reshape(-1, 3), normals.reshape(-1, 3)
-
-
-def _coarse_ball() -> tuple[np.ndarray, np.ndarray]:
-    """Return a coarse unit sphere: an octahedron subdivided twice, 66 vertices (n,3) and 128 triangles (t,3)."""
-    points = np.concatenate([np.eye(3), -np.eye(3)])
-    faces = [(x, y, z) for x in (0, 3) for y in (1, 4) for z in (2, 5)]
-    # with an odd number of negative axes, the order x, y, z would point inward
-    triangles = np.array([f if sum(k > 2 for k in f) % 2 == 0 else f[::-1] for f in faces])
-    for _ in range(2):
-        points, triangles = subdivide(points, triangles)
-        points = unit(points)
-    return points, triangles
