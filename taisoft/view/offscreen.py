@@ -105,7 +105,7 @@ class Offscreen(SceneView):
 
     def _triangles(self, x: np.ndarray, attributes: np.ndarray, lines: tuple) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return projected points, triangles and attributes: clipped surfaces, then lines as bands."""
-        x, triangles, attributes = self.camera.clipped(x, self.surfaces.triangles, attributes, self.size)
+        x, triangles, attributes = self.camera.clipped(x, self.surfaces.triangles, attributes)
         points = self.camera.project(x, self._samples)
         ends, line_colours = self.camera.clipped_lines(*lines)
         if len(ends) == 0:
