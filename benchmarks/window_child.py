@@ -21,11 +21,11 @@ import taisoft as ts
 from benchmarks.window_kinds import spend
 from taisoft.cli.scene_file import load_scene
 from taisoft.output.viewpoint import Viewpoint
-from taisoft.view.live import LiveRun
-from taisoft.view.picking import pick
 from taisoft.view.sampling import Sampler
-from taisoft.view.screen import MESSAGES, PANEL, SIZE, free_part
-from taisoft.view.window import WindowProcess
+from taisoft.view.window.live import LiveRun
+from taisoft.view.window.picking import pick
+from taisoft.view.window.screen import MESSAGES, PANEL, SIZE, free_part
+from taisoft.view.window.window import WindowProcess
 
 LONGEST = 60.0  # wall time of the run in the window [s]
 DRAGS, PAUSE, PIXELS = 250, 0.02, 4  # movements of the mouse, time between two [s], size

@@ -32,8 +32,8 @@ from taisoft.scene import checks
 from taisoft.scene.numbers import set_numbers
 from taisoft.scene.scene import Scene
 from taisoft.simulator import Simulator
-from taisoft.view.ggui import display_missing, vulkan_missing
 from taisoft.view.plots import Plots
+from taisoft.view.window.ggui import display_missing, vulkan_missing
 
 RUN_KEYS = ("seconds", "fps", "quantities")  # arguments of Simulator.run that a `solver` dict may hold too
 COMPANIONS = {  # by --error-mesh
@@ -249,7 +249,7 @@ def _window_is_possible() -> bool:
 
 def _show_window(sim: Simulator, settings: RunSettings, shown: DisplayOptions) -> int:
     """Show the live window until it is closed."""
-    from taisoft.view.window import show
+    from taisoft.view.window.window import show
 
     show(sim, fps=settings.fps, colour=shown.picture.colour, layers=shown.in_window)
     print_state(sim)
@@ -270,7 +270,7 @@ def _run(sim, settings: RunSettings, arguments, signals, warned: list[str], save
             stack.callback(recording.release)
         stack.callback(observers.close)
         if shown.window:
-            from taisoft.view.window import LiveWindow
+            from taisoft.view.window.window import LiveWindow
 
             observers.members.append(LiveWindow(sim, colour=shown.picture.colour, layers=shown.in_window))
         if recording is not None:

@@ -6,8 +6,8 @@ import pytest
 import taisoft as ts
 from taisoft.nested import from_json, to_json
 from taisoft.view.drawn import DrawnScene, DrawnState
-from taisoft.view.ggui import vulkan_missing
 from taisoft.view.sampling import Sampler
+from taisoft.view.window.ggui import vulkan_missing
 from tests.dynamics.scenes import rubber
 from tests.view.fake_simulator import beam_scene
 

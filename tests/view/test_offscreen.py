@@ -13,12 +13,12 @@ from taisoft.errors import OutputError, SimulationError
 from taisoft.mesh.placing import FROM_Y_UP
 from taisoft.output.viewpoint import Viewpoint, start_positions
 from taisoft.view.colouring import GRADIENT, Colouring, lit_colours, round_up
-from taisoft.view.ggui import Canvas
 from taisoft.view.layers import IMPULSE_COLOUR, NORMAL_COLOUR, TRACTION_COLOUR, WIRE_COLOUR
 from taisoft.view.offscreen import Offscreen, stroke
 from taisoft.view.raster import Raster
 from taisoft.view.scene_view import MARKER_COLOUR, Surfaces
-from taisoft.view.window import show
+from taisoft.view.window.ggui import Canvas
+from taisoft.view.window.window import show
 from tests.dynamics.scenes import rubber
 from tests.view.drawing import SIZE, body_mask, needs_vulkan, pixels, sampled
 from tests.view.fake_simulator import FakeSimulator, beam_scene

@@ -10,10 +10,10 @@ import taichi as ti
 
 import taisoft as ts
 from taisoft.output.viewpoint import FILL, Viewpoint, framed_points
-from taisoft.view.controls import Controls, touching_pairs
-from taisoft.view.panel import Panel, Requests, range_about
-from taisoft.view.screen import MESSAGES, PANEL, SIZE, Screen, free_part
-from taisoft.view.timing import Timing
+from taisoft.view.window.controls import Controls, touching_pairs
+from taisoft.view.window.panel import Panel, Requests, range_about
+from taisoft.view.window.screen import MESSAGES, PANEL, SIZE, Screen, free_part
+from taisoft.view.window.timing import Timing
 from tests.view.drawing import connected_scene, cubes_scene, sampled
 from tests.view.fake_simulator import FakeSimulator
 
@@ -233,7 +233,7 @@ class FakeCanvas(Gui):
 def screen(cubes, monkeypatch):
     """The window of the cubes, its canvas, and a function that draws with keys and buttons pressed and returns the commands."""
     canvas, requests, drawn = FakeCanvas(), Requests(), sampled(cubes)
-    monkeypatch.setattr("taisoft.view.screen.Canvas", lambda *_, **__: canvas)
+    monkeypatch.setattr("taisoft.view.window.screen.Canvas", lambda *_, **__: canvas)
     shown = {"colour": "body", "layers": ("fixed_nodes",), "controls": True, "pairs": touching_pairs(cubes)}
     screen, state = Screen(drawn.scene, shown, requests), state_of(Controls(cubes)) | {"status": "", "messages": []}
 

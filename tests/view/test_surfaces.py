@@ -12,10 +12,10 @@ from taisoft.view.drawn import DrawnScene
 from taisoft.view.ground import Square, finite_points
 from taisoft.view.layers import Layers
 from taisoft.view.offscreen import Offscreen
-from taisoft.view.picking import MouseDrag, pick
 from taisoft.view.scene_view import MARKER_COLOUR, Surfaces
 from taisoft.view.shadow import Shadows, blurred
-from taisoft.view.window_shadow import ShadowMesh
+from taisoft.view.window.picking import MouseDrag, pick
+from taisoft.view.window.window_shadow import ShadowMesh
 from tests.view.drawing import sampled
 from tests.view.fake_simulator import RUBBER, FakeSimulator, beam_scene
 

@@ -8,14 +8,14 @@ import taichi as ti
 from taisoft.output.viewpoint import MAX_WIDENING, Viewpoint
 from taisoft.view.colouring import BACKGROUND
 from taisoft.view.drawn import DrawnScene, DrawnState
-from taisoft.view.ggui import Canvas
-from taisoft.view.keys import ACTIONS
 from taisoft.view.layers import IN_FRONT
-from taisoft.view.panel import Panel, Requests, wrapped
-from taisoft.view.picking import MouseDrag, pick
 from taisoft.view.scene_view import SceneView
-from taisoft.view.timing import Note, Timing
-from taisoft.view.window_shadow import ShadowMesh
+from taisoft.view.window.ggui import Canvas
+from taisoft.view.window.keys import ACTIONS
+from taisoft.view.window.panel import Panel, Requests, wrapped
+from taisoft.view.window.picking import MouseDrag, pick
+from taisoft.view.window.timing import Note, Timing
+from taisoft.view.window.window_shadow import ShadowMesh
 
 SIZE = (1280, 720)
 PANEL = (0.012, 0.02, 0.31, 0.96)  # left, top, width, height as fractions of the window's initial size

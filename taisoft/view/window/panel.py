@@ -13,8 +13,8 @@ from taisoft.dynamics.schemes import CHOICES, SCHEMES, STATIC
 from taisoft.settings import contact_solvers
 from taisoft.view.choices import COLOURS
 from taisoft.view.colouring import Colouring, following
-from taisoft.view.keys import KEYS
 from taisoft.view.layers import Layers
+from taisoft.view.window.keys import KEYS
 
 MAX_FRICTION = 1.5
 STRENGTHS = (0.3, 300.0)  # of the drag force over the body's weight, for a displacement as long as the body's diagonal
