@@ -146,8 +146,8 @@ def value_of(case: Force, steps: int = 1, **settings) -> float:
 def estimated(case: Force) -> Quantity:
     """Run a scene with its companions."""
     with ts.Simulator(case.build(case.cells[0]), dt=1.0, precision="f64") as sim:
-        companion = case.build(case.cells[1])
-        return sim.run(case.steps, fps=None, error=True, error_mesh=companion, quantities={"force": case.quantity}).quantities[
+        other = case.build(case.cells[1])
+        return sim.run(case.steps, fps=None, error=True, error_mesh=other, quantities={"force": case.quantity}).quantities[
             "force"
         ]
 

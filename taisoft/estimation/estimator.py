@@ -66,7 +66,7 @@ class ErrorEstimator:
         self._energies = np.zeros(4)  # differences to the first companion at the last comparison [J]
         self._means: list[
             list[np.ndarray]
-        ] = []  # per comparison: mean positions of the bodies, of the run and of the first companion
+        ] = []  # per comparison: mean positions of the bodies, of the run and its first companion
         try:
             with collected_warnings():  # the run has given them
                 self._make_companions(steps, mesh)
@@ -80,25 +80,25 @@ class ErrorEstimator:
         sim = self._sim
         of_mesh = {}
         if mesh is not None:
-            companion, ratios = on_mesh(sim, mesh)
+            one, ratios = on_mesh(sim, mesh)
             soft = [ratio for body, ratio in zip(sim.scene.bodies, ratios) if not isinstance(body, RigidBody)]
             nearest = min((abs(np.log(ratio or 1.0)), ratio) for ratio in soft)[1] if soft else None  # to 1: the largest error
             self._width = nearest and [nearest]
             factors = [error_over_difference(r, MESH_ORDER) if r else 1.0 for r in ratios]  # 1: the order differs, not the width
-            of_mesh = {"space": (self._add(companion), np.array(factors))}
-        self._in_time = [self._add(companion) for companion in other_steps(sim, steps)]
+            of_mesh = {"space": (self._add(one), np.array(factors))}
+        self._in_time = [self._add(one) for one in other_steps(sim, steps)]
         tight = tighter(sim)
         of_solver = {} if tight is None else {"solver": (self._add(tight), np.full(len(self._sizes), SOLVER_FACTOR))}
         self._others = of_solver | of_mesh
-        self._stride = max(companion.per for companion in self._in_time)
+        self._stride = max(one.per for one in self._in_time)
         if len(self._in_time) > 1:
             self._between = Differences(self._bodies)  # of the two companions
 
-    def _add(self, companion: Companion) -> Companion:
+    def _add(self, one: Companion) -> Companion:
         """Add a companion, and return it."""
-        self._companions.append(companion)
-        self._differences[companion] = Differences(self._bodies[companion.own])
-        return companion
+        self._companions.append(one)
+        self._differences[one] = Differences(self._bodies[one.own])
+        return one
 
     def next_comparison(self, end: int) -> int:
         """The step count at which to call `compare` before `end`, or else `end` itself."""
@@ -116,8 +116,8 @@ class ErrorEstimator:
             return
         begin, compiled = time.perf_counter(), self._sim.compile_seconds
         with collected_warnings():  # of companions, not of the run
-            for companion in self._companions:
-                companion.follow(steps)
+            for one in self._companions:
+                one.follow(steps)
         self._compare()
         self._samples.add(self._sim, self._companions)
         self.wall_seconds += time.perf_counter() - begin - (self._sim.compile_seconds - compiled)
@@ -133,11 +133,11 @@ class ErrorEstimator:
         x = self._sim.positions()
         self._excursion = max(self._excursion, float(np.sqrt(((x - self._start) ** 2).sum(axis=1).max())))
         self.times.append(self._sim.time)
-        found = {companion: companion.positions() for companion in self._companions if not companion.failed}
-        for companion, other in found.items():
-            self._differences[companion].add(x[companion.own], other)
+        found = {one: one.positions() for one in self._companions if not one.failed}
+        for one, other in found.items():
+            self._differences[one].add(x[one.own], other)
         self._made = None
-        if any(companion.failed for companion in self._in_time):
+        if any(one.failed for one in self._in_time):
             return
         first = found[self._in_time[0]]
         if len(self._in_time) > 1:
@@ -156,16 +156,16 @@ class ErrorEstimator:
         factor = self._time_factor(count)[0] if 0 < count == len(self.times) else None
         if factor is None:
             return np.full(len(found), np.nan)
-        for companion, scales in ((self._in_time[0], np.full(len(self._sizes), factor)), *self._others.values()):
+        for one, scales in ((self._in_time[0], np.full(len(self._sizes), factor)), *self._others.values()):
             errors = np.full(len(found), np.nan)
-            if not companion.failed:
-                errors[companion.own] = scales[self._bodies[companion.own]] * self._differences[companion].map
+            if not one.failed:
+                errors[one.own] = scales[self._bodies[one.own]] * self._differences[one].map
             found += errors
         return found
 
     def _time_factor(self, k: int) -> tuple[float | None, float | None]:
         """Error in time over the difference to the first companion, and order, from the first k comparisons; None if unknown."""
-        if any(companion.failed for companion in self._in_time):
+        if any(one.failed for one in self._in_time):
             return None, None
         fine = self._differences[self._in_time[0]]
         if len(self._in_time) == 1:
@@ -206,7 +206,7 @@ class ErrorEstimator:
         most = 2.0 if settings.integrator in SECOND_ORDER else 1.0
         if "solver" in self._others:
             levels["solver"] = [self._others["solver"][0]], [TIGHTER], SOLVER_ORDER, SOLVER_ORDER
-        levels["time"] = self._in_time, [companion.ratio for companion in self._in_time], nominal, most
+        levels["time"] = self._in_time, [one.ratio for one in self._in_time], nominal, most
         if "space" in self._others:
             levels["space"] = [self._others["space"][0]], self._width, quantities.MESH_ORDER, quantities.MESH_ORDER
         self._samples.set_errors(found, levels, self._sim.time, self._rounding)
@@ -221,48 +221,46 @@ class ErrorEstimator:
             made.notes.append(f"the errors are unknown: {why}")
         else:
             self._estimate_time(made)
-            for kind, (companion, factors) in self._others.items():
-                self._estimate(made, kind, companion, factors)
+            for kind, (one, factors) in self._others.items():
+                self._estimate(made, kind, one, factors)
             if "solver" not in self._others:
                 made.solver = 0.0  # nothing is solved
-        made.companions = [companion.what for companion in self._companions]
+        made.companions = [one.what for one in self._companions]
         return made
 
-    def _estimate(self, made: ErrorEstimate, kind: str, companion: Companion, factors: np.ndarray) -> None:
+    def _estimate(self, made: ErrorEstimate, kind: str, one: Companion, factors: np.ndarray) -> None:
         """Set one kind of error from the differences to a companion, or note the reason that it is unknown."""
-        if companion.failed:
-            made.notes.append(f"the error of {kind} is unknown: its companion ({companion.what}) failed: {companion.failed}")
+        if one.failed:
+            made.notes.append(f"the error of {kind} is unknown: its companion ({one.what}) failed: {one.failed}")
             return
-        if companion.unconverged:
-            made.notes.append(
-                f"of the companion with {companion.what}, {companion.unconverged} of {companion.reports} steps did not converge"
-            )
+        if one.unconverged:
+            made.notes.append(f"of the companion with {one.what}, {one.unconverged} of {one.reports} steps did not converge")
         count = self._agreeing()
         if 0 < len(self.times) != count:  # then these differences come from parted paths too
             made.notes.append(f"the error of {kind} is unknown, since the paths part")
             return
-        errors = factors * self._differences[companion].largest() / self._excursion
+        errors = factors * self._differences[one].largest() / self._excursion
         for body, value in zip(made.bodies.values(), errors):
             setattr(body, kind, float(value))
         setattr(made, kind, float(errors.max()))
 
     def _estimate_time(self, made: ErrorEstimate) -> None:
         """Set the error in time; where the paths part, only that until then."""
-        failed = [companion for companion in self._in_time if companion.failed]
+        failed = [one for one in self._in_time if one.failed]
         if failed:
             made.notes.append(f"the error in time is unknown: the companion with {failed[0].what} failed: {failed[0].failed}")
             return
         count = self._agreeing()
         factor, made.order = self._time_factor(count) if count else (None, None)
-        companion = self._in_time[0]
+        one = self._in_time[0]
         if count == len(self.times) and factor is not None:
-            self._estimate(made, "time", companion, np.full(len(self._sizes), factor))
-            sign = 1.0 if companion.ratio < 1.0 else -1.0  # the exact path lies beyond the finer one
+            self._estimate(made, "time", one, np.full(len(self._sizes), factor))
+            sign = 1.0 if one.ratio < 1.0 else -1.0  # the exact path lies beyond the finer one
             made.energies = Energies(*(sign * factor * self._energies).tolist())
             return
         if factor is not None:
             made.agree_until = self.times[count - 1]
-            made.time_until_then = float(factor * self._differences[companion].largest(count).max() / self._excursion)
+            made.time_until_then = float(factor * self._differences[one].largest(count).max() / self._excursion)
             made.spread_after = self._spread(count)
         when = f"after t = {made.agree_until:.4g} s" if made.agree_until is not None else "from the start"
         parted = "the paths of different steps part"
@@ -272,7 +270,7 @@ class ErrorEstimator:
 
     def _agreeing(self) -> int:
         """Number of comparisons over which the paths of different steps agree; all of them if a companion failed."""
-        if not self.times or any(companion.failed for companion in self._in_time):
+        if not self.times or any(one.failed for one in self._in_time):
             return len(self.times)
         fine = self._differences[self._in_time[0]]
         if len(self._in_time) > 1:
@@ -281,10 +279,9 @@ class ErrorEstimator:
         return int(parted[0]) if len(parted) else len(fine.maxima)
 
     def _spread(self, count: int) -> dict[str, float]:
-        """Per body: distance of its mean positions in run and companion after the first `count` comparisons, over the
-        excursion."""
-        run, companion = (np.mean([means[k] for means in self._means[count:]], axis=0) for k in (0, 1))
-        apart = np.linalg.norm(run - companion, axis=1) / self._excursion
+        """Per body: distance of its mean positions in the two runs after the first `count` comparisons, over the excursion."""
+        run, one = (np.mean([means[k] for means in self._means[count:]], axis=0) for k in (0, 1))
+        apart = np.linalg.norm(run - one, axis=1) / self._excursion
         return {body.name: float(value) for body, value in zip(self._sim.scene.bodies, apart)}
 
     def close(self) -> None:

@@ -200,9 +200,9 @@ class Samples:
         """Measure in the run and in those of its companions that have not failed."""
         self._time = sim.time
         for name, definition in self._quantities.items():
-            for companion in (None, *(one for one in companions if not one.failed)):
-                value, self._reasons[name, companion] = definition.measure(sim if companion is None else companion.sim)
-                self._values.setdefault((name, companion), []).append(np.nan if value is None else value)
+            for one in (None, *(one for one in companions if not one.failed)):
+                value, self._reasons[name, one] = definition.measure(sim if one is None else one.sim)
+                self._values.setdefault((name, one), []).append(np.nan if value is None else value)
 
     def set_errors(self, found: dict[str, Quantity], levels: dict[str, tuple], time: float, rounding: float) -> None:
         """Set the errors of the quantities of a run that ended at `time` [s].
@@ -222,16 +222,16 @@ class Samples:
                 quantity.notes += [f"steps of a companion did not converge: {', '.join(unsolved)}"] if unsolved else []
             if abs(self._time - time) > 1e-9 * time:
                 quantity.notes.append(
-                    f"the errors of {name!r} are those at t = {self._time:.6g} s, where the companions meet the run"
+                    f"the errors of {name!r} are those at t = {self._time:.6g} s, where companions meet the run"
                 )
 
     def _error(
         self, name: str, companions: list, sizes: list | None, nominal: float, most: float, rounding: float, solved: float
     ):
-        for companion in (None, *companions):
-            if reason := self._reasons.get((name, companion)) or (companion and companion.failed):
-                return LevelError(None, reason=f"in the {f'companion with {companion.what}' if companion else 'run'}, {reason}")
-        values = np.array([self._values[name, companion] for companion in (None, *companions)])
+        for one in (None, *companions):
+            if reason := self._reasons.get((name, one)) or (one and one.failed):
+                return LevelError(None, reason=f"in the {f'companion with {one.what}' if one else 'run'}, {reason}")
+        values = np.array([self._values[name, one] for one in (None, *companions)])
         if sizes is None:
             return LevelError(float(abs(values[1, -1] - values[0, -1])))
         negligible = max(rounding * float(np.nanmax(np.abs(values))), solved)  # errors of the solvers show no order

@@ -169,7 +169,7 @@ def test_a_quantity_without_a_value_in_a_companion():
     note = "the error of 'q' in time is unknown: in the companion with dt = 0.03125 s, ZeroDivisionError: division by zero"
     assert q.value == 1.0 and q.time is None and q.solver == 0.0 and q.notes == [note] and report.status == "ok"
     late = run(StandIn(block()), 66 / 64, fps=64 / 6, error=True, quantities={"q": lambda sim: sim.time}).quantities["q"]
-    assert late.notes == ["the errors of 'q' are those at t = 1 s, where the companions meet the run"]
+    assert late.notes == ["the errors of 'q' are those at t = 1 s, where companions meet the run"]
 
     def change(sim, k, _report):
         sim.changes += k == 5
