@@ -11,7 +11,7 @@ READY := $(VENV)/ready
 DOCS_READY := $(VENV)/docs-ready
 DEMO_OUT := out/hanging_beam
 
-NO_WINDOW := import sys; from taisoft.view.ggui import display_missing, vulkan_missing; m = display_missing() or vulkan_missing(); \
+NO_WINDOW := import sys; from taisoft.view.window.ggui import display_missing, vulkan_missing; m = display_missing() or vulkan_missing(); \
   sys.exit(f'No window here, since {m}; make demo writes pictures instead.' if m else 0)
 
 .PHONY: demo window test test-long figures docs wheel lint clean

@@ -5,10 +5,10 @@ taisoft bench error [--only NAME ...] [--quick] [--budget SECONDS] [--keep DIR] 
 Each scene runs once with error=True and error_mesh="refined" (`taisoft.estimation`), in single precision. True errors are
 distances to other runs at the frames, over the largest excursion: in time to one with a sixteenth of the step in double
 precision; of the solvers to one with the same step, tolerances of 1e-9 and 1e-8 of the contact laws, in double precision; in
-space, at the nodes of the first mesh, to one on the mesh refined twice with the steps of the first, or of its twin if they are
-explicit. An excursion is the largest distance of a node from its start. Ratio: estimate over truth. Twins: their wall time over
-the run's, without that on the refined mesh. Forces: see `error_quantities`. Exit status: 0, or 1 if too many ratios are outside
-their limits or a case could not be measured. --only force: contact forces alone.
+space, at the nodes of the first mesh, to one on the mesh refined twice with the steps of the first, or of its companion if they
+are explicit. An excursion is the largest distance of a node from its start. Ratio: estimate over truth. Companions: their wall
+time over the run's, without that on the refined mesh. Forces: see `error_quantities`. Exit status: 0, or 1 if too many ratios are
+outside their limits or a case could not be measured. --only force: contact forces alone.
 """
 
 import math
@@ -29,7 +29,7 @@ from .error_quantities import FORCES, Force, ForceRow, force_limits, force_row, 
 from .runner import without_warnings
 from .suite import LEFT_OUT, chosen, runs_of, suite_options, suite_parser
 
-STEPS_A_FRAME = 4  # of implicit runs: twins with four times the step then meet every frame
+STEPS_A_FRAME = 4  # of implicit runs: companions with four times the step then meet every frame
 EXPLICIT_FPS = 1000.0  # frames per second of explicit runs [1/s]
 TRUTH = 16  # the run's dt over that of the truth in time
 EXACT = {"newton_tolerance": 1e-9, "contact_tolerance": 1e-8}
@@ -54,7 +54,7 @@ class Row:
     order: float | None
     estimated: dict[str, float | None]
     true: dict[str, float]
-    twins: float  # wall time of the twins over that of the run
+    companions: float  # wall time of the companions over that of the run
     notes: list[str] = field(default_factory=list)
 
     def ratio(self, what: str) -> float:
@@ -77,7 +77,7 @@ def step_of(case: Case) -> float:
 
 
 def measured(case: Case) -> Row:
-    """Run a scene, its twins and its truths."""
+    """Run a scene, its companions and its truths."""
     dt, path = step_of(case), []
     with ts.Simulator(case.build(), dt=dt, integrator=case.integrator) as sim:
         warm = sim.run(case.seconds, fps=fps_of(case))  # compiled, so that times compare
@@ -104,7 +104,7 @@ def measured(case: Case) -> Row:
         order=estimate.order,
         estimated={what: getattr(estimate, what) for what in ERROR_KINDS},
         true=true_errors(case, dt, path, bodies),
-        twins=result.error_estimate.wall_seconds / result.wall_seconds,
+        companions=result.error_estimate.wall_seconds / result.wall_seconds,
         notes=estimate.notes,
     )
 
@@ -141,7 +141,7 @@ def row_table(rows: list[Row]) -> str:
         ("order", lambda r: "-" if r.order is None else f"{r.order:.2f}"),
         *estimate_columns("space", "%", percent),
         *estimate_columns("solver", "%", percent),
-        ("twins / run", lambda r: f"{r.twins:.2g}"),
+        ("companions / run", lambda r: f"{r.companions:.2g}"),
     )
     return table(rows, columns, [f"{row.name}: {note}" for row in rows for note in row.notes])
 

@@ -1,9 +1,10 @@
 """Errors of contact forces in double precision, for `taisoft bench error`: scenes with references, each on two meshes.
 
 A soft half ball pressed on a plane, smooth and rough; a block pushed over a rough plane; a half ball pressed on a block. Steps of
-implicit Euler of bodies with almost no mass are load steps. The twin on another mesh is the scene with half, or twice, the cells.
-Bodies start at the contact offset, which depends on the mesh. True errors: in space, the distance to the reference; in time, to
-the run with TRUTH times the steps on the same mesh; of the solvers, to one with tolerances of EXACT, which not every mesh meets.
+implicit Euler of bodies with almost no mass are load steps. The companion on another mesh is the scene with half, or twice, the
+cells. Bodies start at the contact offset, which depends on the mesh. True errors: in space, the distance to the reference; in
+time, to the run with TRUTH times the steps on the same mesh; of the solvers, to one with tolerances of EXACT, which not every
+mesh meets.
 """
 
 import math
@@ -32,7 +33,7 @@ PUSHED = (0.0, 0.0, 2e-3, 4e-3, 6e-3, 8e-3, 1e-2)  # displacements of the block'
 
 @dataclass(frozen=True)
 class Force:
-    """A force in a scene. build: number of cells -> scene; steps: of 1 s; cells: of the run and of its twin; truth: [N]."""
+    """A force in a scene. build: number of cells -> scene; steps: of 1 s; cells: of the run and of its companion; truth: [N]."""
 
     name: str
     build: Callable[[int], ts.Scene] = field(repr=False)
@@ -143,10 +144,12 @@ def value_of(case: Force, steps: int = 1, **settings) -> float:
 
 
 def estimated(case: Force) -> Quantity:
-    """Run a scene with its twins."""
+    """Run a scene with its companions."""
     with ts.Simulator(case.build(case.cells[0]), dt=1.0, precision="f64") as sim:
-        twin = case.build(case.cells[1])
-        return sim.run(case.steps, fps=None, error=True, error_mesh=twin, quantities={"force": case.quantity}).quantities["force"]
+        other = case.build(case.cells[1])
+        return sim.run(case.steps, fps=None, error=True, error_mesh=other, quantities={"force": case.quantity}).quantities[
+            "force"
+        ]
 
 
 def force_row(case: Force) -> ForceRow:
@@ -164,7 +167,7 @@ def force_table(rows: list[ForceRow]) -> str:
     columns = (
         ("<scene", lambda r: r.name),
         ("cells", lambda r: str(r.cells[0])),
-        ("of the twin", lambda r: str(r.cells[1])),
+        ("of the companion", lambda r: str(r.cells[1])),
         ("<quantity", lambda r: r.quantity),
         ("value [N]", lambda r: f"{r.value:.5g}"),
         *(column for kind in ERROR_KINDS for column in estimate_columns(kind, "N", "{:.2g}".format)),

@@ -18,7 +18,8 @@ import ipctk
 import numpy as np
 
 from taisoft import Simulator
-from taisoft.mesh.solids import connected_parts, winding_numbers
+from taisoft.mesh.distances import winding_numbers
+from taisoft.mesh.solids import connected_parts
 from taisoft.scene.obstacles import Capsule, HalfSpace, Sphere
 
 DET_ERROR = 1e-15  # bound of the rounding error of a determinant, relative to the sum of its absolute terms

@@ -17,7 +17,7 @@ from statistics import median
 from taisoft.errors import OutputError
 from taisoft.files import write_bytes
 from taisoft.output.tables import markdown
-from taisoft.view.keys import KEYS, MOUSE
+from taisoft.view.window.keys import KEYS, MOUSE
 
 from .cuda_check import TABLES as GPU_TABLES
 from .document import RESULTS, table

@@ -9,8 +9,8 @@ excursion, to a run in double precision with small steps: 128 a frame, explicit 
 and 1e-8 of the contact laws. Implicit and explicit steps have a reference each, since quadratic elements have another mass matrix
 in explicit steps and impacts another law. A reference's own error is its distance to a run with half as many steps.
 References are kept in the user's cache until scenes or code that runs with given steps change.
-Seconds are from the call of Simulator to the end of the run, with pilots, without compiling: medians of repeated runs, in turns
-with the best fixed setting. With frames: where an observer gets them, as in `taisoft run`, so that a pilot is not the run. Best:
+Seconds are from the call of Simulator to the end of the run, with trials, without compiling: medians of repeated runs, in turns
+with the best fixed setting. With frames: where an observer gets them, as in `taisoft run`, so that a trial is not the run. Best:
 the fastest fixed setting that meets the tolerance. Exit status: 0, or 1 if a limit is not met.
 """
 
@@ -76,8 +76,8 @@ class Row:
     true: float
     own: float
     seconds: float
-    observed: float  # seconds with frames that are observed, so that a pilot is not the run
-    pilots: float  # [s]
+    observed: float  # seconds with frames that are observed, so that a trial is not the run
+    trials: float  # [s]
     best: Fixed | None
 
     @property
@@ -203,7 +203,7 @@ class Scene:
             own=self.distance(self.truth(integrator in EXPLICIT, 2), integrator in EXPLICIT),
             seconds=seconds[-1],
             observed=seconds[-2],
-            pilots=report.pilot_seconds,
+            trials=report.trial_seconds,
             best=replace(best, seconds=seconds[0]) if best else None,
         )
 
@@ -225,7 +225,7 @@ def row_table(rows: list[Row]) -> str:
         ("<met", lambda r: "yes" if r.met else "no, but reported" if r.status != "ok" else "no"),
         ("seconds", lambda r: f"{r.seconds:.3g}"),
         ("with frames", lambda r: f"{r.observed:.3g}"),
-        ("of pilots", lambda r: f"{r.pilots:.2g}"),
+        ("of trials", lambda r: f"{r.trials:.2g}"),
         ("<best fixed", best),
         ("seconds over best", lambda r: "-" if math.isnan(r.ratio) else f"{r.ratio:.2f}"),
     )

@@ -24,11 +24,11 @@ import taisoft as ts
 from taisoft.cli.scene_file import load_scene, shipped_files
 from taisoft.errors import MissingPackage
 from taisoft.output.viewpoint import Viewpoint
-from taisoft.view.live import LiveRun
-from taisoft.view.picking import pick
 from taisoft.view.sampling import Sampler
-from taisoft.view.screen import MESSAGES, PANEL, SIZE, free_part
-from taisoft.view.window import WindowProcess
+from taisoft.view.window.live import LiveRun
+from taisoft.view.window.picking import pick
+from taisoft.view.window.screen import MESSAGES, PANEL, SIZE, free_part
+from taisoft.view.window.window import WindowProcess
 
 from .children import in_child
 from .document import Limit, begin, table

@@ -88,7 +88,7 @@ def _refuse_foresight(sim: "Simulator", call: str) -> None:
     if sim.settings.tolerance is not None:
         raise SimulationError(f"{call}: with a tolerance, steps are chosen ahead, and commands cannot be foreseen: give a path")
     if sim._estimator is not None:
-        raise SimulationError(f"{call}: the twins of a run with error=True do not follow commands: give a path")
+        raise SimulationError(f"{call}: the companions of a run with error=True do not follow commands: give a path")
 
 
 def refuse_commands(sim: "Simulator", what: str) -> None:

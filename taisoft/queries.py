@@ -172,7 +172,7 @@ def error_so_far(self: "Simulator") -> ErrorEstimate | None:
 def nodal_errors(self: "Simulator", body: str | None = None) -> np.ndarray:
     """Return estimated errors of the node positions (n_nodes,) [m] during a run with error=True; body: as for `positions`.
 
-    They are those of the last comparison with the twins, in time, of the solvers and, with error_mesh, in space, added:
+    They are those of the last comparison with the companions, in time, of the solvers and, with error_mesh, in space, added:
     without sign, and often twice the true error. NaN where a part is unknown, as before the first comparison, or in space at
     nodes that the other mesh lacks; `np.nanmax` leaves those out. Raises SimulationError outside such a run.
     """

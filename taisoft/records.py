@@ -121,15 +121,15 @@ class ErrorEstimate(BodyError):
     """
 
     excursion: float = 0.0  #: [m]
-    order: float | None = None  #: in time, as observed, or assumed if one twin has a smaller step
+    order: float | None = None  #: in time, as observed, or assumed if one companion has a smaller step
     agree_until: float | None = None  #: where the paths of different steps part: time until which they agree [s]
     time_until_then: float | None = None  #: error in time up to `agree_until`
     spread_after: dict[str, float] = field(default_factory=dict)  #: afterwards: by body, change of its mean position by the step
     bodies: dict[str, BodyError] = field(default_factory=dict)  #: by name
     energies: Energies | None = None  #: errors in time at the last comparison, energy minus exact energy [J]
-    twins: list[str] = field(default_factory=list)  #: how the errors were estimated, a sentence each
+    companions: list[str] = field(default_factory=list)  #: how the errors were estimated, a sentence each
     notes: list[str] = field(default_factory=list)  #: reasons for caution, sentences
-    wall_seconds: float = 0.0  #: of the twins, without compile time [s]; not in the run's
+    wall_seconds: float = 0.0  #: of the companions, without compile time [s]; not in the run's
 
     def __repr__(self) -> str:
         known = [f"{kind} {percent(getattr(self, kind))} %" for kind in ERROR_KINDS if getattr(self, kind) is not None]
@@ -150,7 +150,7 @@ class RunReport:
     step_reports: list[StepReport] = field(default_factory=list)  #: one a step; of explicit runs one a frame
     dt: float | None = None  #: of its steps [s]
     dt_requested: float | None = None  #: that the simulator had, where the run changed it to fit the frames [s]
-    pilot_seconds: float = 0.0  #: wall time of the pilots of a run with a tolerance, without compile time [s]
+    trial_seconds: float = 0.0  #: wall time of the trials of a run with a tolerance, without compile time [s]
     error_estimate: ErrorEstimate | None = None  #: of a run with error=True or a tolerance
     quantities: dict[str, Quantity] = field(default_factory=dict)  #: of a run with `quantities`, at its end, by name
 

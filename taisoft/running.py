@@ -89,19 +89,19 @@ def run(
     and in long ones; True ends the run. dt is lowered once to the next divisor of 1/fps, or rounded to one within NEAR of it,
     which the report notes. resumed: seconds and frames count from time 0, not from now; the first frame is `first_frame`.
     on_step(report, seconds): called after every implicit step and every batch of explicit steps, with its wall time without
-    compilation [s]. error: estimate the error of the positions by twins (`taisoft.estimation`), simulators that follow the run
-    with other steps and tighter tolerances; the report holds it. error_mesh: also estimate the error of the mesh, by a twin on
-    another one: "refined", "order" (the elements' other order), or the same scene on a mesh that shares nodes. on_iteration(n):
-    called a few times a second in implicit steps of more than 1 s of wall time, with their Newton iterations so far. details:
-    some of "pairs", "bodies" and "quantities": each report then holds forces, torques and slip velocities of the pairs that
-    pressed in its last step, energies of bodies, and the quantities, see `StepReport.details`; about: the point of torques, as of
-    `details`. quantities: functions of the simulator that return a number, or texts such as "contact_force.x finger fruit"
-    (docs/errors.md), by name; the report holds their values at the end and, with error=True, their errors. Functions see the
-    twins too, whose mesh may have other nodes.
-    A run that fails, or that `stop` ends, does not raise: see the report's status and problems. Ctrl-C undoes the present step
-    and is raised as KeyboardInterrupt; `stop` alone ends a run in another thread than the main one. Raises SimulationError for
-    bad arguments, and for a twin that cannot be made. A simulator with a tolerance first chooses integrator and dt by pilots,
-    unless the run is resumed; the report then holds the error in time.
+    compilation [s]. error: estimate the error of the positions by companions (`taisoft.estimation`), simulators that follow the
+    run with other steps and tighter tolerances; the report holds it. error_mesh: also estimate the error of the mesh, by a
+    companion on another one: "refined", "order" (the elements' other order), or the same scene on a mesh that shares nodes.
+    on_iteration(n): called a few times a second in implicit steps of more than 1 s of wall time, with their Newton iterations so
+    far. details: some of "pairs", "bodies" and "quantities": each report then holds forces, torques and slip velocities of the
+    pairs that pressed in its last step, energies of bodies, and the quantities, see `StepReport.details`; about: the point of
+    torques, as of `details`. quantities: functions of the simulator that return a number, or texts such as "contact_force.x
+    finger fruit" (docs/errors.md), by name; the report holds their values at the end and, with error=True, their errors.
+    Functions see the companions too, whose mesh may have other nodes. A run that fails, or that `stop` ends, does not raise: see
+    the report's status and problems. Ctrl-C undoes the present step and is raised as KeyboardInterrupt; `stop` alone ends a run
+    in another thread than the main one. Raises SimulationError for bad arguments, and for a companion that cannot be made. A
+    simulator with a tolerance first chooses integrator and dt by trials, unless the run is resumed; the report then holds the
+    error in time.
     """
     fps = None if sim.settings.static else fps
     if error_mesh is not None and not error:

@@ -34,7 +34,7 @@ class Simulator(Guarded):
     "coloured_gauss_seidel", "jacobi" or "hybrid", in implicit ones "augmented_lagrangian". self_collision: whether bodies touch
     themselves. precision: "f32" or "f64". arch: "cpu" or "cuda". newton_tolerance, linear_tolerance, contact_tolerance: relative;
     None: the default of the precision, for linear solves adaptive. draggable: allow `drag`.
-    tolerance: wanted error of positions in time over the largest excursion; `run` then chooses integrator and dt by pilots
+    tolerance: wanted error of positions in time over the largest excursion; `run` then chooses integrator and dt by trials
     (`taisoft.estimation.tolerance`), whatever they were before, and tolerances that are None follow from it.
     budget: wall time for an implicit step in time [s]. Where it is used up Newton's method ends at its last iterate, after one
     iteration at least; bodies that would then pass through something, or invert, are held back. Such steps are reported as not
@@ -128,7 +128,7 @@ class Simulator(Guarded):
     run = running.run
 
     def _begin_estimate(self, steps: int, mesh: str | Scene | None, measured: dict) -> "ErrorEstimator":
-        """Make the twins of a run of `steps` steps, in which quantities are measured too; see `run`."""
+        """Make the companions of a run of `steps` steps, in which quantities are measured too; see `run`."""
         from taisoft.estimation.estimator import ErrorEstimator  # loads modules with kernels that the run may not need
 
         if self._estimator is not None:
@@ -138,7 +138,7 @@ class Simulator(Guarded):
         return self._estimator
 
     def _end_estimate(self) -> None:
-        """Release the twins of a run."""
+        """Release the companions of a run."""
         if self._estimator is not None:
             self._estimator.close()
             self._estimator = None

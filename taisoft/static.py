@@ -156,9 +156,9 @@ def solve_static(
     With contacts that may act, or `steps`, the load is applied in `steps` load steps (default 1), each cut where it does not
     converge: prescribed nodes, obstacles and loads that have paths follow them from 0 to `time` (default 1) [s], constant loads
     and gravity grow from 0. Each load step is one of backward Euler for friction: displacements since its start count as slip, so
-    that with friction the result depends on `steps`; error=True estimates by how much, with twins of other load steps and tighter
-    tolerances, and with error_mesh the error of the mesh, as `Simulator.run` does, whose `quantities` are those here.
-    An open runtime of this precision is reused; otherwise one is opened and closed. Maxwell branches are relaxed, and nothing
+    that with friction the result depends on `steps`; error=True estimates by how much, with companions of other load steps and
+    tighter tolerances, and with error_mesh the error of the mesh, as `Simulator.run` does, whose `quantities` are those here. An
+    open runtime of this precision is reused; otherwise one is opened and closed. Maxwell branches are relaxed, and nothing
     rebounds. Raises SceneError for invalid arguments, and if nothing can hold a body, SimulationError if nothing does, or if the
     runtime is in use. A solve that does not converge returns converged=False.
     """

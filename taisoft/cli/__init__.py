@@ -20,6 +20,7 @@ from importlib.util import find_spec
 from taisoft import __version__
 from taisoft.errors import OutputError, SceneError, TaisoftError, no_memory
 from taisoft.study import Request, Setting
+from taisoft.view.choices import COLOURS, LAYERS, PLOTS
 
 EXIT_FAILED = 1
 EXIT_BAD_INPUT = 2
@@ -247,8 +248,7 @@ def _add_run(add) -> None:
     option("--about", type=float, nargs=3, metavar=("X", "Y", "Z"), help="point of torques [m] (default: centres of mass)")
     option("--error", action="store_true", help="estimate the error by runs with other steps and tolerances beside this one")
     option("--error-mesh", choices=("refined", "order"), help="also by one on another mesh; implies --error")
-    plots = "on pictures: energies, residuals, iterations, contacts, step_time, error, forces, torques, kinetic, elastic"
-    option("--plots", metavar="NAME,...", help=plots)
+    option("--plots", metavar="NAME,...", help=f"on pictures: {', '.join(PLOTS)}")
     option("--no-frames", action="store_true", help="write no pictures")
     option("--verbose", action="store_true", help="print why each feature of the plan is on, and which are left out")
 
@@ -264,10 +264,8 @@ def _add_pictures(option, colouring: str) -> None:
     option("--view", type=float, nargs=2, metavar=("AZIMUTH", "ELEVATION"), help=directions)
     camera = "a .toml file with a table [camera], or its keys, as in 'position = [3, 2, 4], target = [0, 0.5, 0], fov = 30'"
     option("--camera", metavar="CAMERA", help=camera)
-    colours = ("body", "stress", "stretch", "speed", "pressure", "slip", "error")
-    option("--colour", choices=colours, default="body", help=colouring)
-    layers = "what they show besides bodies: wires, contacts, tractions, pressures, connections, fibres, fixed_nodes, or none"
-    option("--layers", metavar="NAME,...", help=layers)
+    option("--colour", choices=tuple(COLOURS), default="body", help=colouring)
+    option("--layers", metavar="NAME,...", help=f"what they show besides bodies: {', '.join(LAYERS)}, or none")
     option("--caption", action="store_true", help="write scene, frame, time and energies on pictures")
 
 

@@ -11,9 +11,9 @@ from taisoft.scene.look import Camera
 from taisoft.scene.tables import Table
 from taisoft.scene.toml import parsed
 from taisoft.view.annotations import text_missing
+from taisoft.view.choices import IN_PICTURES, LAYERS
 from taisoft.view.offscreen import SIZE, checked_size
 from taisoft.view.pictures import PictureOptions
-from taisoft.view.scene_view import IN_PICTURES, LAYERS
 
 
 def picture_options(arguments: Namespace, plots: tuple[str, ...] = (), name: str | None = None) -> PictureOptions:

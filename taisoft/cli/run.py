@@ -32,11 +32,11 @@ from taisoft.scene import checks
 from taisoft.scene.numbers import set_numbers
 from taisoft.scene.scene import Scene
 from taisoft.simulator import Simulator
-from taisoft.view.ggui import display_missing, vulkan_missing
 from taisoft.view.plots import Plots
+from taisoft.view.window.ggui import display_missing, vulkan_missing
 
 RUN_KEYS = ("seconds", "fps", "quantities")  # arguments of Simulator.run that a `solver` dict may hold too
-TWINS = {  # by --error-mesh
+COMPANIONS = {  # by --error-mesh
     None: "for two to three times its work",
     "refined": "the one on the refined mesh for some 10 to 40 times its work: see docs/errors.md",
     "order": "one of them with the other order of elements",
@@ -113,7 +113,7 @@ def run(arguments: Namespace) -> int:
                 if not definitions(sim, settings.quantities) and "quantities" in shown.details:
                     raise SceneError("--details quantities: the run has none, give --quantity")
                 if arguments.error_mesh is not None:
-                    from taisoft.estimation.twins import other_mesh  # loads modules with kernels that the run may not need
+                    from taisoft.estimation.companions import other_mesh  # loads modules with kernels that the run may not need
 
                     other_mesh(sim, arguments.error_mesh)  # refuse it before earlier results are removed
             return _run(sim, settings, arguments, signals, warned, saved, shown)
@@ -249,7 +249,7 @@ def _window_is_possible() -> bool:
 
 def _show_window(sim: Simulator, settings: RunSettings, shown: DisplayOptions) -> int:
     """Show the live window until it is closed."""
-    from taisoft.view.window import show
+    from taisoft.view.window.window import show
 
     show(sim, fps=settings.fps, colour=shown.picture.colour, layers=shown.in_window)
     print_state(sim)
@@ -270,7 +270,7 @@ def _run(sim, settings: RunSettings, arguments, signals, warned: list[str], save
             stack.callback(recording.release)
         stack.callback(observers.close)
         if shown.window:
-            from taisoft.view.window import LiveWindow
+            from taisoft.view.window.window import LiveWindow
 
             observers.members.append(LiveWindow(sim, colour=shown.picture.colour, layers=shown.in_window))
         if recording is not None:
@@ -278,9 +278,9 @@ def _run(sim, settings: RunSettings, arguments, signals, warned: list[str], save
         progress = Progress(settings.seconds, label=Path(arguments.scene).stem)
         observers.members.append(progress)
         if shown.errors:
-            print(f"twins    follow the run, {TWINS[arguments.error_mesh]}", flush=True)
+            print(f"error    companions follow the run, {COMPANIONS[arguments.error_mesh]}", flush=True)
         if sim.settings.tolerance is not None and resumed is None:
-            print("pilots   choose integrator and dt", flush=True)
+            print("trials   choose integrator and dt", flush=True)
         result = sim.run(
             settings.seconds,
             on_frame=observers.on_frame,

@@ -50,10 +50,10 @@ def print_summary(result: RunReport, sim, observers: Observers, recording: Recor
     print_state(sim)
     output = f"{observers.seconds:.2f} s of it for output"
     compiling = f"{result.compile_seconds:.2f} s for kernels"
-    pilots = f"{result.pilot_seconds:.2f} s of pilots and " if result.pilot_seconds else ""
-    twins = result.error_estimate.wall_seconds if result.error_estimate is not None else 0.0
-    twins_text = f"{twins:.2f} s of twins for the error and " if twins else ""
-    _print_lines("wall", [f"{result.wall_seconds:.2f} s, {output}; plus {pilots}{twins_text}{compiling}"])
+    trials = f"{result.trial_seconds:.2f} s of trials and " if result.trial_seconds else ""
+    companions = result.error_estimate.wall_seconds if result.error_estimate is not None else 0.0
+    companions_text = f"{companions:.2f} s of companions for the error and " if companions else ""
+    _print_lines("wall", [f"{result.wall_seconds:.2f} s, {output}; plus {trials}{companions_text}{compiling}"])
     if observers.picture_seconds > MOST * result.wall_seconds:
         share = f"{observers.picture_seconds:.2f} s of it, {observers.picture_seconds / result.wall_seconds:.0%}, for pictures"
         _print_lines("", [f"{share}: a lower --fps draws fewer, --no-frames none"])

@@ -15,7 +15,8 @@ from taisoft.collision.analytic import AnalyticObstacles
 from taisoft.collision.colliders import Topology
 from taisoft.collision.surface import Surface
 from taisoft.fem.model import Layout
-from taisoft.mesh.solids import are_inside, connected_parts, distances, inner_depths, inner_tets, is_closed
+from taisoft.mesh.distances import are_inside, distances, is_closed
+from taisoft.mesh.solids import connected_parts, inner_depths, inner_tets
 from taisoft.scene.body import Body
 from taisoft.scene.connections import attached_pairs
 from taisoft.scene.locate import locate, weight_matrix

@@ -10,7 +10,8 @@ import numpy as np
 
 from taisoft.backend.arrays import download
 from taisoft.collision.detector import Detection
-from taisoft.mesh.solids import ALLOWED, Solid, distances, overlap_depth, segment_distance, shell_tets
+from taisoft.mesh.distances import distances, segment_distance
+from taisoft.mesh.solids import ALLOWED, Solid, overlap_depth, shell_tets
 from taisoft.scene.connections import attached_pairs
 from taisoft.scene.obstacles import Capsule, HalfSpace, Sphere
 

@@ -1,1 +1,1 @@
-"""Error estimates of a run, from twins: other runs of the same scene with another step, tighter tolerances or another mesh."""
+"""Error estimates of a run, from companions: runs of the same scene with another step, tighter tolerances or another mesh."""

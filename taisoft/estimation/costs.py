@@ -16,7 +16,7 @@ PATH_STEP = 90.0  # [us] of a prescribed path, or a moving obstacle, in a step
 EXPLICIT_TET, QUADRATIC = 0.025, 4.0  # [us] of a linear tet in an explicit step; a quadratic one costs as many
 IMPLICIT_STEP, NEWTON, NEWTON_TET = 150.0, 40.0, 0.15  # [us] of a step and of an iteration
 LINEAR, LINEAR_TET, MULTIPLIERS = 12.0, 0.008, 150.0  # [us] of an iteration of conjugate gradients and of a multiplier update
-SHOWN = 1 / 3  # part of a pilot whose steps cost as much on average as all of its steps, or nearly
+SHOWN = 1 / 3  # part of a trial whose steps cost as much on average as all of its steps, or nearly
 LEAST = {False: (2.0, 4.0, 0.0), True: (2.5, 6.0, 4.0)}  # iterations of an implicit step, at least; key: whether bodies touch
 
 
@@ -52,9 +52,9 @@ class Spent(Exception):
 
 
 def budget(scene: Scene, touches: bool, limit: float, steps: float) -> Callable[[StepReport, float], None]:
-    """Return an `on_step` of a pilot of implicit steps that raises Spent if they cost more on average than a limit [us].
+    """Return an `on_step` of a trial of implicit steps that raises Spent if they cost more on average than a limit [us].
 
-    steps: of the pilot. They may cost the limit times their number, or times the part SHOWN of all of them if that is more.
+    steps: of the trial. They may cost the limit times their number, or times the part SHOWN of all of them if that is more.
     """
     cost, taken = 0.0, 0  # [us], steps
 

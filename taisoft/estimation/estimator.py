@@ -1,15 +1,17 @@
-"""Estimates the error of a run while it runs, from twins that keep step with it (`twins`, `order`).
+"""Estimates the error of a run while it runs, from companions that keep step with it (`companions`, `order`).
 
-In time: two twins with twice and four times the step show the observed order, and cost three quarters of the run. Where explicit
-steps would be unstable, or the run has few steps, one twin has half the step; the order is then assumed to be the nominal one,
-on which the estimate depends little. Of the solvers: a twin with tighter tolerances. In space: a twin on another mesh.
+In time: two companions with twice and four times the step show the observed order, and cost three quarters of the run. Where
+explicit steps would be unstable, or the run has few steps, one companion has half the step; the order is then assumed to be the
+nominal one, on which the estimate depends little. Of the solvers: a companion with tighter tolerances. In space: a companion on
+another mesh.
 
-Twins and run are compared at the last step of every frame at which all of them meet. Differences are reduced to their maximum
-over the nodes of each body, and to sums of squares. The order is that of the root mean square over nodes and times, which chance
-affects less than maxima. If the paths of different steps part, so do those of all twins: the errors are known only up to then.
+Companions and run are compared at the last step of every frame at which all of them meet. Differences are reduced to their
+maximum over the nodes of each body, and to sums of squares. The order is that of the root mean square over nodes and times, which
+chance affects less than maxima. If the paths of different steps part, so do those of all companions: the errors are known only up
+to then.
 
-Weak: twice the step may miss what happens within it; an error that all twins share, such as contacts that none of them finds,
-is not seen. Rounding is not estimated.
+Weak: twice the step may miss what happens within it; an error that all companions share, such as contacts that none of them
+finds, is not seen. Rounding is not estimated.
 """
 
 import dataclasses
@@ -21,9 +23,9 @@ import numpy as np
 from taisoft.dynamics.schemes import SECOND_ORDER
 from taisoft.errors import collected_warnings
 from taisoft.estimation import quantities
+from taisoft.estimation.companions import TIGHTER, Companion, on_mesh, other_steps, tighter
 from taisoft.estimation.comparison import Differences
 from taisoft.estimation.order import MESH_ORDER, MIN_ORDER, agreement, error_over_difference, nominal_order, observed_order
-from taisoft.estimation.twins import TIGHTER, Twin, on_mesh, other_steps, tighter
 from taisoft.ranges import owners
 from taisoft.records import BodyError, Energies, ErrorEstimate, Quantity
 from taisoft.scene.rigid import RigidBody
@@ -34,25 +36,25 @@ if TYPE_CHECKING:
 
 SOLVER_ORDER = 1  # errors are about proportional to the tolerances
 SOLVER_FACTOR = error_over_difference(TIGHTER, SOLVER_ORDER)
-PARTED = 0.1  # with one twin: difference, over the excursion, above which paths may have parted for good
+PARTED = 0.1  # with one companion: difference, over the excursion, above which paths may have parted for good
 NEGLIGIBLE = {"f32": 1e-6, "f64": 1e-9}  # differences, over the excursion, that are rounding
 SOLVED = 0.01  # differences, over the excursion and Newton's tolerance, that come from this
 
 
 class ErrorEstimator:
-    """Twins of a run of `steps` steps. Call `compare` at steps for `next_comparison`; `estimate` gives the errors so far.
+    """Companions of a run of `steps` steps. Call `compare` at steps for `next_comparison`; `estimate` gives the errors so far.
 
-    mesh: see `twins.on_mesh`; measured: the quantities of `set_errors`. Raises SceneError or SimulationError if a twin cannot be
-    made.
+    mesh: see `companions.on_mesh`; measured: the quantities of `set_errors`. Raises SceneError or SimulationError if a companion
+    cannot be made.
     """
 
     def __init__(self, sim: "Simulator", steps: int, mesh: str | Scene | None, measured: dict[str, quantities.Definition]):
         begin, compiled = time.perf_counter(), sim.compile_seconds
         self._sim, self._first, self._given = sim, sim.step_count, (sim._host().changes, sim.dt)
         self._changed = ""
-        self._twins: list[Twin] = []
-        self._others: dict[str, tuple[Twin, np.ndarray]] = {}  # of solver and mesh, and errors over differences (n_bodies,)
-        self._differences: dict[Twin, Differences] = {}
+        self._companions: list[Companion] = []
+        self._others: dict[str, tuple[Companion, np.ndarray]] = {}  # of solver and mesh, and errors over differences (n_bodies,)
+        self._differences: dict[Companion, Differences] = {}
         self.times: list[float] = []
         self._made: ErrorEstimate | None = None  # since the last comparison
         self._samples = quantities.Samples(measured)
@@ -61,40 +63,42 @@ class ErrorEstimator:
         self._bodies = owners(self._sizes)
         self._start = sim.positions()
         self._excursion = 0.0
-        self._energies = np.zeros(4)  # differences to the first twin at the last comparison [J]
-        self._means: list[list[np.ndarray]] = []  # per comparison: mean positions of the bodies, of the run and of the first twin
+        self._energies = np.zeros(4)  # differences to the first companion at the last comparison [J]
+        self._means: list[
+            list[np.ndarray]
+        ] = []  # per comparison: mean positions of the bodies, of the run and its first companion
         try:
             with collected_warnings():  # the run has given them
-                self._make_twins(steps, mesh)
+                self._make_companions(steps, mesh)
         except BaseException:
             self.close()
             raise
         self.wall_seconds = time.perf_counter() - begin - (sim.compile_seconds - compiled)
 
-    def _make_twins(self, steps: int, mesh: str | Scene | None) -> None:
-        """Make the twins: first that on another mesh, since it may be refused, then those of other steps and tolerances."""
+    def _make_companions(self, steps: int, mesh: str | Scene | None) -> None:
+        """Make the companions: first that on another mesh, since it may be refused, then those of other steps and tolerances."""
         sim = self._sim
         of_mesh = {}
         if mesh is not None:
-            twin, ratios = on_mesh(sim, mesh)
+            one, ratios = on_mesh(sim, mesh)
             soft = [ratio for body, ratio in zip(sim.scene.bodies, ratios) if not isinstance(body, RigidBody)]
             nearest = min((abs(np.log(ratio or 1.0)), ratio) for ratio in soft)[1] if soft else None  # to 1: the largest error
             self._width = nearest and [nearest]
             factors = [error_over_difference(r, MESH_ORDER) if r else 1.0 for r in ratios]  # 1: the order differs, not the width
-            of_mesh = {"space": (self._add(twin), np.array(factors))}
-        self._in_time = [self._add(twin) for twin in other_steps(sim, steps)]
+            of_mesh = {"space": (self._add(one), np.array(factors))}
+        self._in_time = [self._add(one) for one in other_steps(sim, steps)]
         tight = tighter(sim)
         of_solver = {} if tight is None else {"solver": (self._add(tight), np.full(len(self._sizes), SOLVER_FACTOR))}
         self._others = of_solver | of_mesh
-        self._stride = max(twin.per for twin in self._in_time)
+        self._stride = max(one.per for one in self._in_time)
         if len(self._in_time) > 1:
-            self._between = Differences(self._bodies)  # of the two twins
+            self._between = Differences(self._bodies)  # of the two companions
 
-    def _add(self, twin: Twin) -> Twin:
-        """Add a twin, and return it."""
-        self._twins.append(twin)
-        self._differences[twin] = Differences(self._bodies[twin.own])
-        return twin
+    def _add(self, one: Companion) -> Companion:
+        """Add a companion, and return it."""
+        self._companions.append(one)
+        self._differences[one] = Differences(self._bodies[one.own])
+        return one
 
     def next_comparison(self, end: int) -> int:
         """The step count at which to call `compare` before `end`, or else `end` itself."""
@@ -102,7 +106,7 @@ class ErrorEstimator:
         return latest if latest > self._sim.step_count else end
 
     def compare(self) -> None:
-        """Let the twins follow, and compare, if the run is at a whole step of all."""
+        """Let the companions follow, and compare, if the run is at a whole step of all."""
         steps = self._sim.step_count - self._first
         if self._changed or not steps or steps % self._stride:
             return
@@ -111,15 +115,15 @@ class ErrorEstimator:
             self._made = None  # an estimate read before the change
             return
         begin, compiled = time.perf_counter(), self._sim.compile_seconds
-        with collected_warnings():  # of twins, not of the run
-            for twin in self._twins:
-                twin.follow(steps)
+        with collected_warnings():  # of companions, not of the run
+            for one in self._companions:
+                one.follow(steps)
         self._compare()
-        self._samples.add(self._sim, self._twins)
+        self._samples.add(self._sim, self._companions)
         self.wall_seconds += time.perf_counter() - begin - (self._sim.compile_seconds - compiled)
 
     def _change(self) -> str:
-        """Why twins cannot follow any more; "" if they can."""
+        """Why companions cannot follow any more; "" if they can."""
         if self._sim.dragged is not None:
             return "the run was dragged"
         now = self._sim._host().changes, self._sim.dt
@@ -129,11 +133,11 @@ class ErrorEstimator:
         x = self._sim.positions()
         self._excursion = max(self._excursion, float(np.sqrt(((x - self._start) ** 2).sum(axis=1).max())))
         self.times.append(self._sim.time)
-        found = {twin: twin.positions() for twin in self._twins if not twin.failed}
-        for twin, other in found.items():
-            self._differences[twin].add(x[twin.own], other)
+        found = {one: one.positions() for one in self._companions if not one.failed}
+        for one, other in found.items():
+            self._differences[one].add(x[one.own], other)
         self._made = None
-        if any(twin.failed for twin in self._in_time):
+        if any(one.failed for one in self._in_time):
             return
         first = found[self._in_time[0]]
         if len(self._in_time) > 1:
@@ -152,16 +156,16 @@ class ErrorEstimator:
         factor = self._time_factor(count)[0] if 0 < count == len(self.times) else None
         if factor is None:
             return np.full(len(found), np.nan)
-        for twin, scales in ((self._in_time[0], np.full(len(self._sizes), factor)), *self._others.values()):
+        for one, scales in ((self._in_time[0], np.full(len(self._sizes), factor)), *self._others.values()):
             errors = np.full(len(found), np.nan)
-            if not twin.failed:
-                errors[twin.own] = scales[self._bodies[twin.own]] * self._differences[twin].map
+            if not one.failed:
+                errors[one.own] = scales[self._bodies[one.own]] * self._differences[one].map
             found += errors
         return found
 
     def _time_factor(self, k: int) -> tuple[float | None, float | None]:
-        """Error in time over the difference to the first twin, and order, from the first k comparisons; None if unknown."""
-        if any(twin.failed for twin in self._in_time):
+        """Error in time over the difference to the first companion, and order, from the first k comparisons; None if unknown."""
+        if any(one.failed for one in self._in_time):
             return None, None
         fine = self._differences[self._in_time[0]]
         if len(self._in_time) == 1:
@@ -202,7 +206,7 @@ class ErrorEstimator:
         most = 2.0 if settings.integrator in SECOND_ORDER else 1.0
         if "solver" in self._others:
             levels["solver"] = [self._others["solver"][0]], [TIGHTER], SOLVER_ORDER, SOLVER_ORDER
-        levels["time"] = self._in_time, [twin.ratio for twin in self._in_time], nominal, most
+        levels["time"] = self._in_time, [one.ratio for one in self._in_time], nominal, most
         if "space" in self._others:
             levels["space"] = [self._others["space"][0]], self._width, quantities.MESH_ORDER, quantities.MESH_ORDER
         self._samples.set_errors(found, levels, self._sim.time, self._rounding)
@@ -217,46 +221,46 @@ class ErrorEstimator:
             made.notes.append(f"the errors are unknown: {why}")
         else:
             self._estimate_time(made)
-            for kind, (twin, factors) in self._others.items():
-                self._estimate(made, kind, twin, factors)
+            for kind, (one, factors) in self._others.items():
+                self._estimate(made, kind, one, factors)
             if "solver" not in self._others:
                 made.solver = 0.0  # nothing is solved
-        made.twins = [twin.what for twin in self._twins]
+        made.companions = [one.what for one in self._companions]
         return made
 
-    def _estimate(self, made: ErrorEstimate, kind: str, twin: Twin, factors: np.ndarray) -> None:
-        """Set one kind of error from the differences to a twin, or note the reason that it is unknown."""
-        if twin.failed:
-            made.notes.append(f"the error of {kind} is unknown: its twin ({twin.what}) failed: {twin.failed}")
+    def _estimate(self, made: ErrorEstimate, kind: str, one: Companion, factors: np.ndarray) -> None:
+        """Set one kind of error from the differences to a companion, or note the reason that it is unknown."""
+        if one.failed:
+            made.notes.append(f"the error of {kind} is unknown: its companion ({one.what}) failed: {one.failed}")
             return
-        if twin.unconverged:
-            made.notes.append(f"of the twin with {twin.what}, {twin.unconverged} of {twin.reports} steps did not converge")
+        if one.unconverged:
+            made.notes.append(f"of the companion with {one.what}, {one.unconverged} of {one.reports} steps did not converge")
         count = self._agreeing()
         if 0 < len(self.times) != count:  # then these differences come from parted paths too
             made.notes.append(f"the error of {kind} is unknown, since the paths part")
             return
-        errors = factors * self._differences[twin].largest() / self._excursion
+        errors = factors * self._differences[one].largest() / self._excursion
         for body, value in zip(made.bodies.values(), errors):
             setattr(body, kind, float(value))
         setattr(made, kind, float(errors.max()))
 
     def _estimate_time(self, made: ErrorEstimate) -> None:
         """Set the error in time; where the paths part, only that until then."""
-        failed = [twin for twin in self._in_time if twin.failed]
+        failed = [one for one in self._in_time if one.failed]
         if failed:
-            made.notes.append(f"the error in time is unknown: the twin with {failed[0].what} failed: {failed[0].failed}")
+            made.notes.append(f"the error in time is unknown: the companion with {failed[0].what} failed: {failed[0].failed}")
             return
         count = self._agreeing()
         factor, made.order = self._time_factor(count) if count else (None, None)
-        twin = self._in_time[0]
+        one = self._in_time[0]
         if count == len(self.times) and factor is not None:
-            self._estimate(made, "time", twin, np.full(len(self._sizes), factor))
-            sign = 1.0 if twin.ratio < 1.0 else -1.0  # the exact path lies beyond the finer one
+            self._estimate(made, "time", one, np.full(len(self._sizes), factor))
+            sign = 1.0 if one.ratio < 1.0 else -1.0  # the exact path lies beyond the finer one
             made.energies = Energies(*(sign * factor * self._energies).tolist())
             return
         if factor is not None:
             made.agree_until = self.times[count - 1]
-            made.time_until_then = float(factor * self._differences[twin].largest(count).max() / self._excursion)
+            made.time_until_then = float(factor * self._differences[one].largest(count).max() / self._excursion)
             made.spread_after = self._spread(count)
         when = f"after t = {made.agree_until:.4g} s" if made.agree_until is not None else "from the start"
         parted = "the paths of different steps part"
@@ -265,8 +269,8 @@ class ErrorEstimator:
         made.notes.append(f"the error in time is unknown: {parted} {when}")
 
     def _agreeing(self) -> int:
-        """Number of comparisons over which the paths of different steps agree; all of them if a twin failed, so that none can."""
-        if not self.times or any(twin.failed for twin in self._in_time):
+        """Number of comparisons over which the paths of different steps agree; all of them if a companion failed."""
+        if not self.times or any(one.failed for one in self._in_time):
             return len(self.times)
         fine = self._differences[self._in_time[0]]
         if len(self._in_time) > 1:
@@ -275,12 +279,12 @@ class ErrorEstimator:
         return int(parted[0]) if len(parted) else len(fine.maxima)
 
     def _spread(self, count: int) -> dict[str, float]:
-        """Per body: distance of its mean positions in run and twin after the first `count` comparisons, over the excursion."""
-        run, twin = (np.mean([means[k] for means in self._means[count:]], axis=0) for k in (0, 1))
-        apart = np.linalg.norm(run - twin, axis=1) / self._excursion
+        """Per body: distance of its mean positions in the two runs after the first `count` comparisons, over the excursion."""
+        run, one = (np.mean([means[k] for means in self._means[count:]], axis=0) for k in (0, 1))
+        apart = np.linalg.norm(run - one, axis=1) / self._excursion
         return {body.name: float(value) for body, value in zip(self._sim.scene.bodies, apart)}
 
     def close(self) -> None:
-        """Release the twins' memory; a second call does nothing."""
-        while self._twins:
-            self._twins.pop().sim.close()
+        """Release the companions' memory; a second call does nothing."""
+        while self._companions:
+            self._companions.pop().sim.close()

@@ -1,4 +1,4 @@
-"""Settings of a simulator with a tolerance, before its first run: what is likely to meet it, without pilots."""
+"""Settings of a simulator with a tolerance, before its first run: what is likely to meet it, without trials."""
 
 import dataclasses
 import math

@@ -27,7 +27,7 @@ from taisoft.scene.locate import locate
 from taisoft.scene.rigid import RigidBody
 
 if TYPE_CHECKING:
-    from taisoft.estimation.twins import Twin
+    from taisoft.estimation.companions import Companion
     from taisoft.simulator import Simulator
 
 MESH_ORDER = 1.5  # of quantities in the mesh width: see above
@@ -188,46 +188,50 @@ def error_of_levels(
 
 
 class Samples:
-    """Values of quantities in a run and its twins, at each comparison."""
+    """Values of quantities in a run and its companions, at each comparison."""
 
     def __init__(self, quantities: dict[str, Definition]):
         self._quantities = quantities
         self._time = 0.0  # of the last comparison [s]
-        self._values: dict[tuple, list[float]] = {}  # by name and twin, None for the run; NaN where there is none
+        self._values: dict[tuple, list[float]] = {}  # by name and companion, None for the run; NaN where there is none
         self._reasons: dict[tuple, str] = {}  # why the last one is NaN
 
-    def add(self, sim: "Simulator", twins: list["Twin"]) -> None:
-        """Measure in the run and in those of its twins that have not failed."""
+    def add(self, sim: "Simulator", companions: list["Companion"]) -> None:
+        """Measure in the run and in those of its companions that have not failed."""
         self._time = sim.time
         for name, definition in self._quantities.items():
-            for twin in (None, *(one for one in twins if not one.failed)):
-                value, self._reasons[name, twin] = definition.measure(sim if twin is None else twin.sim)
-                self._values.setdefault((name, twin), []).append(np.nan if value is None else value)
+            for one in (None, *(one for one in companions if not one.failed)):
+                value, self._reasons[name, one] = definition.measure(sim if one is None else one.sim)
+                self._values.setdefault((name, one), []).append(np.nan if value is None else value)
 
     def set_errors(self, found: dict[str, Quantity], levels: dict[str, tuple], time: float, rounding: float) -> None:
         """Set the errors of the quantities of a run that ended at `time` [s].
 
-        levels: by kind of error, twins, and sizes, nominal and highest order as in `error_of_levels`, but sizes are None where
-        the difference itself counts; solvers first. rounding: of values, relative to the largest.
+        levels: by kind of error, companions, and sizes, nominal and highest order as in `error_of_levels`, but sizes are None
+        where the difference itself counts; solvers first. rounding: of values, relative to the largest.
         """
         for name, quantity in found.items():
             quantity.solver = 0.0  # where nothing is solved
-            for kind, (twins, *how) in levels.items():
-                error, order, reason = self._error(name, twins, *how, rounding, quantity.solver or 0.0)
+            for kind, (companions, *how) in levels.items():
+                error, order, reason = self._error(name, companions, *how, rounding, quantity.solver or 0.0)
                 setattr(quantity, kind, error)
                 quantity.orders |= {} if order is None else {kind: order}
                 what = "unknown" if error is None else "the range of its values"
                 quantity.notes += [f"the error of {name!r} in {kind} is {what}: {reason}"] if reason else []
-                unsolved = [f"{one.what} ({one.unconverged} of {one.reports})" for one in twins if one.unconverged]
-                quantity.notes += [f"steps of a twin did not converge: {', '.join(unsolved)}"] if unsolved else []
+                unsolved = [f"{one.what} ({one.unconverged} of {one.reports})" for one in companions if one.unconverged]
+                quantity.notes += [f"steps of a companion did not converge: {', '.join(unsolved)}"] if unsolved else []
             if abs(self._time - time) > 1e-9 * time:
-                quantity.notes.append(f"the errors of {name!r} are those at t = {self._time:.6g} s, where the twins meet the run")
+                quantity.notes.append(
+                    f"the errors of {name!r} are those at t = {self._time:.6g} s, where companions meet the run"
+                )
 
-    def _error(self, name: str, twins: list, sizes: list | None, nominal: float, most: float, rounding: float, solved: float):
-        for twin in (None, *twins):
-            if reason := self._reasons.get((name, twin)) or (twin and twin.failed):
-                return LevelError(None, reason=f"in the {f'twin with {twin.what}' if twin else 'run'}, {reason}")
-        values = np.array([self._values[name, twin] for twin in (None, *twins)])
+    def _error(
+        self, name: str, companions: list, sizes: list | None, nominal: float, most: float, rounding: float, solved: float
+    ):
+        for one in (None, *companions):
+            if reason := self._reasons.get((name, one)) or (one and one.failed):
+                return LevelError(None, reason=f"in the {f'companion with {one.what}' if one else 'run'}, {reason}")
+        values = np.array([self._values[name, one] for one in (None, *companions)])
         if sizes is None:
             return LevelError(float(abs(values[1, -1] - values[0, -1])))
         negligible = max(rounding * float(np.nanmax(np.abs(values))), solved)  # errors of the solvers show no order

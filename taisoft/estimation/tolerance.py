@@ -1,18 +1,18 @@
-"""Runs to a tolerance: pilots (`pilots`) choose integrator and dt, and give the error of the run.
+"""Runs to a tolerance: trials (`trials`) choose integrator and dt, and give the error of the run.
 
-Implicit pilots are a ladder (`ladder`), each with half the step of the one before, that ends where the run needs at most eight
-times as many steps as the last pilot. How many follows from the difference of the last two and its observed order. The second
-pilot skips one, and is the run if it seems far better than it must be. Explicit steps cannot be coarser than stable. Their first
-pilot has the largest stable step. Its velocities, and its hardest part repeated with a slightly smaller step, or also the fastest
-one, show whether it is enough; if that is not sure a second pilot takes a smaller step all the way, and may skip one. Otherwise a
-ladder follows. A pilot that meets the tolerance is the run, which is repeated only if frames or steps are observed, or an
-estimate by twins is asked for.
+Implicit trials are a series (`refinement`), each with half the step of the one before, that ends where the run needs at most
+eight times as many steps as the last trial. How many follows from the difference of the last two and its observed order. The
+second trial skips one, and is the run if it seems far better than it must be. Explicit steps cannot be coarser than stable. Their
+first trial has the largest stable step. Its velocities, and its hardest part repeated with a slightly smaller step, or also the
+fastest one, show whether it is enough; if that is not sure a second trial takes a smaller step all the way, and may skip one.
+Otherwise a refinement follows. A trial that meets the tolerance is the run, which is repeated only if frames or steps are
+observed, or an estimate by companions is asked for.
 
 Which kind of steps a run takes follows from counts (`costs`). Explicit steps are accepted at once where they cost less than
-implicit ones could, and an implicit pilot ends when its steps cost more than explicit ones would. Among implicit methods BDF2 is
+implicit ones could, and an implicit trial ends when its steps cost more than explicit ones would. Among implicit methods BDF2 is
 used: it is of second order, has contacts, and damps what its steps cannot resolve.
 
-Weak: pilots do not show what is faster than all of them (`vibrations`). Where their paths diverge, no step meets the tolerance.
+Weak: trials do not show what is faster than all of them (`vibrations`). Where their paths diverge, no step meets the tolerance.
 """
 
 import math
@@ -25,9 +25,9 @@ from typing import TYPE_CHECKING
 from taisoft.errors import SimulationError, collected_warnings
 from taisoft.estimation.costs import Spent, budget, explicit_step, implicit_step
 from taisoft.estimation.first_choice import EXPLICIT, IMPLICIT, stable_steps
-from taisoft.estimation.ladder import SMALLER, Ladder, implicit_sizes, slightly_more
 from taisoft.estimation.order import is_smooth, may_jump, nominal_order
-from taisoft.estimation.pilots import FASTEST, HARDEST, Part, Pilot, Recorder, distances, make_frames
+from taisoft.estimation.refinement import SMALLER, Refinement, implicit_sizes, slightly_more
+from taisoft.estimation.trials import FASTEST, HARDEST, Part, Recorder, Trial, distances, make_frames
 from taisoft.estimation.vibrations import ERROR as VIBRATIONS
 from taisoft.estimation.vibrations import add_vibrations, are_passed_over
 from taisoft.records import BodyError, ErrorEstimate, RunReport
@@ -39,12 +39,12 @@ if TYPE_CHECKING:
     from taisoft.simulator import Simulator
 
 DEARER = 4.0  # cost of explicit steps, over that of implicit ones that cannot meet the tolerance, at most
-TWO_PILOTS = float(1 + SMALLER)  # cost of explicit steps with their pilots, over that of the first one, at least
-LEAST_FRAMES, MOST_FRAMES = 16, 64  # at which pilots are compared where a run has few, or every step is one
+TWO_TRIALS = float(1 + SMALLER)  # cost of explicit steps with their trials, over that of the first one, at least
+LEAST_FRAMES, MOST_FRAMES = 16, 64  # at which trials are compared where a run has few, or every step is one
 
 
 class Stopped(Exception):
-    """`stop` ended a pilot."""
+    """`stop` ended a trial."""
 
 
 def run_to_tolerance(sim: "Simulator", request: RunRequest) -> RunReport:
@@ -56,22 +56,22 @@ def run_to_tolerance(sim: "Simulator", request: RunRequest) -> RunReport:
     report, clock, compiled = RunReport(), time.perf_counter(), sim.compile_seconds
     chooser = Chooser(sim, request)
     try:
-        with report.failing("the pilots"):
+        with report.failing("the trials"):
             steps = chooser.choose()
     except Stopped:
         report.interrupted = True
-        report.degrade("the run was interrupted during its pilots: nothing was simulated")
-    pilot_seconds = time.perf_counter() - clock - (sim.compile_seconds - compiled)
+        report.degrade("the run was interrupted during its trials: nothing was simulated")
+    trial_seconds = time.perf_counter() - clock - (sim.compile_seconds - compiled)
     if report.problems:
-        report.pilot_seconds, report.compile_seconds = pilot_seconds, sim._take_compile_seconds() + chooser.compile_seconds
+        report.trial_seconds, report.compile_seconds = trial_seconds, sim._take_compile_seconds() + chooser.compile_seconds
         return report
     note = f"note: {chooser.describe(steps)}"
     if chooser.may_adopt(steps):
         report = chooser.adopt()
-        pilot_seconds -= report.wall_seconds
+        trial_seconds -= report.wall_seconds
     else:
         report = chooser.run(steps)
-    report.pilot_seconds = pilot_seconds
+    report.trial_seconds = trial_seconds
     report.compile_seconds += sim._take_compile_seconds() + chooser.compile_seconds
     report.problems.insert(0, note)
     if report.status != "failed" and not report.interrupted:
@@ -81,9 +81,9 @@ def run_to_tolerance(sim: "Simulator", request: RunRequest) -> RunReport:
 
 def _check_run(sim: "Simulator", mesh: str | Scene | None) -> None:
     if sim.dragged is not None:
-        raise SimulationError("a body is being dragged: a run to a tolerance needs it released, since its pilots are others")
+        raise SimulationError("a body is being dragged: a run to a tolerance needs it released, since its trials are others")
     if mesh is not None:
-        from taisoft.estimation.twins import other_mesh  # loads modules that most runs do not need
+        from taisoft.estimation.companions import other_mesh  # loads modules that most runs do not need
 
         other_mesh(sim, mesh)
 
@@ -101,7 +101,7 @@ def _check_error(tolerance: float, report: RunReport) -> None:
 class Chooser:
     """Chooses how a simulator carries out a run.
 
-    A frame of the pilots is a whole part of one of the run, so that there are at least LEAST_FRAMES.
+    A frame of the trials is a whole part of one of the run, so that there are at least LEAST_FRAMES.
     """
 
     def __init__(self, sim: "Simulator", request: RunRequest):
@@ -110,20 +110,20 @@ class Chooser:
         self._parts = 1 if fps is None else max(1, math.ceil(LEAST_FRAMES / (seconds * fps)))  # of a frame of the run
         self._frames = make_frames(sim, seconds, seconds / MOST_FRAMES if fps is None else 1.0 / (fps * self._parts))
         self._sudden = sim.touches or may_jump(sim.scene)
-        self._last_failure: tuple[float, str] | None = None  # of the last pilot, if it failed: when [s], and why
-        self.compile_seconds = 0.0  # of the pilots [s]
-        self.ladder = self._ladder()
+        self._last_failure: tuple[float, str] | None = None  # of the last trial, if it failed: when [s], and why
+        self.compile_seconds = 0.0  # of the trials [s]
+        self.refinement = self._refinement()
 
-    def _ladder(self) -> Ladder:
+    def _refinement(self) -> Refinement:
         sim = self._sim
         integrator = sim.settings.integrator
         impacts = sim.touches and not may_jump(sim.scene) and is_smooth(sim.scene, touches=False)
-        return Ladder(integrator, self._sudden, nominal_order(integrator, sim.scene, sim.touches), self._frames, impacts)
+        return Refinement(integrator, self._sudden, nominal_order(integrator, sim.scene, sim.touches), self._frames, impacts)
 
     # --- choosing -----------------------------------------------------------------------------------------------------
 
     def choose(self) -> int:
-        """Run pilots, set the simulator's integrator, and return the steps of the run in the time of a frame.
+        """Run trials, set the simulator's integrator, and return the steps of the run in the time of a frame.
 
         If they are interrupted or fail, the simulator keeps its own.
         """
@@ -133,147 +133,147 @@ class Chooser:
         explicit = least * explicit_step(sim.scene, sim.touches)
         try:
             if explicit > implicit_step(sim.scene, sim.touches):
-                steps = self._by_implicit_pilots(explicit)
-            return self._by_explicit_pilots(least) if steps is None else steps
+                steps = self._by_implicit_trials(explicit)
+            return self._by_explicit_trials(least) if steps is None else steps
         except BaseException:
             self._use(*given)
             raise
 
     def _use(self, integrator: str, dt: float) -> None:
-        """Let the simulator have an integrator, and begin its ladder."""
+        """Let the simulator have an integrator, and begin its refinement."""
         if self._sim.settings.integrator != integrator:
             with collected_warnings():  # the simulator has given them
                 self._sim._replace(integrator=integrator, dt=dt)
-        self.ladder = self._ladder()
+        self.refinement = self._refinement()
 
-    def _by_implicit_pilots(self, explicit: float) -> int | None:
+    def _by_implicit_trials(self, explicit: float) -> int | None:
         """Steps in the time of a frame; None if explicit ones, at a cost of `explicit` [us] a frame, are cheaper."""
         self._use(IMPLICIT, self._frames.seconds)
-        sim, ladder, sizes = self._sim, self.ladder, implicit_sizes(self._frames.count)
+        sim, refinement, sizes = self._sim, self.refinement, implicit_sizes(self._frames.count)
         while True:
             per_frame = next(sizes)
             steps = float(per_frame) * self._frames.count
             add_cost = budget(sim.scene, sim.touches, explicit / max(1.0, float(per_frame)), steps)
             try:
-                ladder.add(self._pilot(per_frame, on_step=add_cost))
+                refinement.add(self._trial(per_frame, on_step=add_cost))
             except Spent:
                 return None
-            needed = ladder.steps_needed(self._tolerance)
-            last = ladder.pilots[-1] if ladder.pilots else None
+            needed = refinement.steps_needed(self._tolerance)
+            last = refinement.trials[-1] if refinement.trials else None
             cost = implicit_step(sim.scene, sim.touches, last and last.counts_per_step())
-            if self._passes_over_vibrations() and last.per_frame >= 1 and len(ladder.pilots) > 1:
+            if self._passes_over_vibrations() and last.per_frame >= 1 and len(refinement.trials) > 1:
                 if self._is_worth(explicit, cost):
                     return None
                 needed = needed or self._last_steps()
-            likely = max(1, per_frame) if ladder.are_few else ladder.likely_steps(self._tolerance)
+            likely = max(1, per_frame) if refinement.are_few else refinement.likely_steps(self._tolerance)
             if (needed or likely) * cost > explicit:
                 return None
-            if needed is not None or ladder.is_over:
+            if needed is not None or refinement.is_over:
                 return needed or self._last_steps()
 
     def _passes_over_vibrations(self) -> bool:
-        """Whether steps of the last pilot cannot meet the tolerance: they pass over vibrations of bodies that touch in it."""
-        last = self.ladder.pilots[-1] if self.ladder.pilots and self._tolerance < VIBRATIONS else None
+        """Whether steps of the last trial cannot meet the tolerance: they pass over vibrations of bodies that touch in it."""
+        last = self.refinement.trials[-1] if self.refinement.trials and self._tolerance < VIBRATIONS else None
         return bool(last and last.touches) and are_passed_over(self._sim.scene, self._dt(max(Fraction(1), last.per_frame)))
 
     def _is_worth(self, explicit: float, cost: float) -> bool:
-        """Whether explicit steps, at a cost of `explicit` [us] a frame, and their pilots are worth it where implicit ones cannot
-        meet the tolerance: at most DEARER than the cheapest of these, one a frame, and with their pilots at most DEARER than
+        """Whether explicit steps, at a cost of `explicit` [us] a frame, and their trials are worth it where implicit ones cannot
+        meet the tolerance: at most DEARER than the cheapest of these, one a frame, and with their trials at most DEARER than
         these, of `cost` [us] each, would be without vibrations."""
         if explicit > DEARER * implicit_step(self._sim.scene, self._sim.touches):
             return False
-        steps = max(1.0, float(self.ladder.pilots[-1].per_frame) * self.ladder.steps_over_last(self._tolerance))
-        return TWO_PILOTS * explicit <= DEARER * steps * cost
+        steps = max(1.0, float(self.refinement.trials[-1].per_frame) * self.refinement.steps_over_last(self._tolerance))
+        return TWO_TRIALS * explicit <= DEARER * steps * cost
 
     def _dt(self, per_frame: Fraction | int) -> float:
         """Step [s] of so many in the time of a frame."""
         return self._frames.seconds / float(per_frame)
 
-    def _by_explicit_pilots(self, least: int) -> int:
+    def _by_explicit_trials(self, least: int) -> int:
         """Explicit steps in the time of a frame."""
         self._use(EXPLICIT, self._dt(least))
-        ladder, ratio = self.ladder, 1.0
-        pilot = self._pilot(Fraction(least), keeps=(HARDEST, FASTEST) if ladder.is_of_first_order else (HARDEST,))
-        ladder.add(pilot)
-        if ladder.pilots:
-            ladder.expect()
-            ratio = ladder.steps_over_last(self._tolerance)
-            if ladder.meets(self._tolerance) and pilot.report.status == "ok":
-                if self._is_confirmed(pilot):
+        refinement, ratio = self.refinement, 1.0
+        trial = self._trial(Fraction(least), keeps=(HARDEST, FASTEST) if refinement.is_of_first_order else (HARDEST,))
+        refinement.add(trial)
+        if refinement.trials:
+            refinement.expect()
+            ratio = refinement.steps_over_last(self._tolerance)
+            if refinement.meets(self._tolerance) and trial.report.status == "ok":
+                if self._is_confirmed(trial):
                     return least
-        per_frame, replaces = ladder.second_steps(least, ratio)
-        (ladder.replace_first if replaces else ladder.add)(self._pilot(per_frame))
+        per_frame, replaces = refinement.second_steps(least, ratio)
+        (refinement.replace_first if replaces else refinement.add)(self._trial(per_frame))
         while True:
-            steps = ladder.steps_needed(self._tolerance)
-            if steps is not None or ladder.is_over:
+            steps = refinement.steps_needed(self._tolerance)
+            if steps is not None or refinement.is_over:
                 return steps or self._last_steps()
-            following = ladder.next_steps(self._tolerance, per_frame)
-            ladder.add(self._pilot(following))
+            following = refinement.next_steps(self._tolerance, per_frame)
+            refinement.add(self._trial(following))
             per_frame = max(per_frame, following)
 
-    def _is_confirmed(self, pilot: Pilot) -> bool:
-        """Whether parts of the first explicit pilot, run with a slightly smaller step, show that it meets the tolerance."""
-        ladder, steps = self.ladder, slightly_more(int(pilot.per_frame))
-        hardest = self._pilot(steps, part=pilot.parts[HARDEST])
-        ladder.confirm(hardest)
-        if ladder.is_of_first_order and ladder.error is not None and not ladder.meets(self._tolerance):
-            ladder.confirm(hardest, self._pilot(steps, part=pilot.parts[FASTEST]))
-        return ladder.meets(self._tolerance)
+    def _is_confirmed(self, trial: Trial) -> bool:
+        """Whether parts of the first explicit trial, run with a slightly smaller step, show that it meets the tolerance."""
+        refinement, steps = self.refinement, slightly_more(int(trial.per_frame))
+        hardest = self._trial(steps, part=trial.parts[HARDEST])
+        refinement.confirm(hardest)
+        if refinement.is_of_first_order and refinement.error is not None and not refinement.meets(self._tolerance):
+            refinement.confirm(hardest, self._trial(steps, part=trial.parts[FASTEST]))
+        return refinement.meets(self._tolerance)
 
     def _last_steps(self) -> int:
-        """Steps of the last pilot that did not fail. Raises SimulationError if all did."""
-        if not self.ladder.pilots:
-            raise SimulationError(f"every pilot failed, the last one because of {self._last_failure[1]}")
-        return math.ceil(self.ladder.pilots[-1].per_frame)
+        """Steps of the last trial that did not fail. Raises SimulationError if all did."""
+        if not self.refinement.trials:
+            raise SimulationError(f"every trial failed, the last one because of {self._last_failure[1]}")
+        return math.ceil(self.refinement.trials[-1].per_frame)
 
-    def _pilot(self, per_frame: Fraction, part: Part | None = None, **options) -> Pilot:
-        """Run a pilot, see `Frames.pilot`.
+    def _trial(self, per_frame: Fraction, part: Part | None = None, **options) -> Trial:
+        """Run a trial, see `Frames.trial`.
 
         Raises SimulationError if it and the one before fail: smaller steps do not help.
         """
-        pilot = self._frames.pilot(self._sim, per_frame, self._request.stop, part, **options)
-        report, before = pilot.report, self._last_failure
+        trial = self._frames.trial(self._sim, per_frame, self._request.stop, part, **options)
+        report, before = trial.report, self._last_failure
         self.compile_seconds += report.compile_seconds
         if report.interrupted:
             raise Stopped
         if part is not None:  # whether a part fails does not count
-            return pilot
+            return trial
         self._last_failure = (report.sim_seconds, report.problems[-1]) if report.status == "failed" else None
         if before and self._last_failure and abs(report.sim_seconds - before[0]) <= self._frames.seconds:
             raise SimulationError(report.problems[-1])
-        return pilot
+        return trial
 
     def describe(self, steps: int) -> str:
         """What was chosen, in a sentence."""
         chosen = f"{self._sim.settings.integrator}, dt = {self._dt(steps):.4g} s"
-        return f"for a tolerance of {100.0 * self._sim.settings.tolerance:.3g} %: {chosen}, by pilots with {self._pilot_steps()}"
+        return f"for a tolerance of {100.0 * self._sim.settings.tolerance:.3g} %: {chosen}, by trials with {self._trial_steps()}"
 
-    def _pilot_steps(self) -> str:
-        return ", ".join(f"dt = {self._dt(p.per_frame):.4g} s" for p in self.ladder.pilots)
+    def _trial_steps(self) -> str:
+        return ", ".join(f"dt = {self._dt(p.per_frame):.4g} s" for p in self.refinement.trials)
 
     # --- the run --------------------------------------------------------------------------------------------------------
 
     def may_adopt(self, steps: int) -> bool:
-        """Whether the last pilot had the steps and the frames of the run, which nothing observes."""
-        asked, same = self._request, self.ladder.pilots[-1].per_frame == steps and self._parts == 1
+        """Whether the last trial had the steps and the frames of the run, which nothing observes."""
+        asked, same = self._request, self.refinement.trials[-1].per_frame == steps and self._parts == 1
         return same and asked.fps is not None and asked == RunRequest(asked.seconds, asked.fps, asked.stop)
 
     def adopt(self) -> RunReport:
-        """Let the last pilot be the run: take the state at its end, and its report and warnings."""
-        pilot, sim = self.ladder.pilots[-1], self._sim
-        sim._dynamics.restore(pilot.end)
-        for text in pilot.warned:
+        """Let the last trial be the run: take the state at its end, and its report and warnings."""
+        trial, sim = self.refinement.trials[-1], self._sim
+        sim._dynamics.restore(trial.end)
+        for text in trial.warned:
             warnings.warn(text, UserWarning, stacklevel=5)
-        sim._may_soften = sim._may_soften and not pilot.warned
-        self.compile_seconds -= pilot.report.compile_seconds
-        pilot.report.error_estimate = self.estimate(pilot)
-        self._add_vibrations(pilot.report.error_estimate, pilot)
-        return pilot.report
+        sim._may_soften = sim._may_soften and not trial.warned
+        self.compile_seconds -= trial.report.compile_seconds
+        trial.report.error_estimate = self.estimate(trial)
+        self._add_vibrations(trial.report.error_estimate, trial)
+        return trial.report
 
     def run(self, steps: int) -> RunReport:
         """Run the simulator with steps in the time of a frame."""
         sim, asked = self._sim, self._request
-        made = Pilot(sim.settings.integrator, Fraction(steps))
+        made = Trial(sim.settings.integrator, Fraction(steps))
         recorder = Recorder(made, self._frames, Fraction(1, steps) if asked.fps is None else Fraction(self._parts))
 
         def frame(sim: "Simulator", index: int, report) -> None:
@@ -293,32 +293,34 @@ class Chooser:
         self._add_vibrations(report.error_estimate, made)
         return report
 
-    def estimate(self, run: Pilot) -> ErrorEstimate:
-        """The error in time of a run, from its distance to the last pilot with larger steps; if there is none, as expected."""
-        ladder, bodies = self.ladder, self._sim.scene.bodies
-        made = ErrorEstimate(bodies={body.name: BodyError() for body in bodies}, twins=[f"pilots with {self._pilot_steps()}"])
-        last = ladder.pilots[-1]
-        made.excursion = ladder.excursion(run if len(run.positions) > 1 else last)
+    def estimate(self, run: Trial) -> ErrorEstimate:
+        """The error in time of a run, from its distance to the last trial with larger steps; if there is none, as expected."""
+        refinement, bodies = self.refinement, self._sim.scene.bodies
+        made = ErrorEstimate(
+            bodies={body.name: BodyError() for body in bodies}, companions=[f"trials with {self._trial_steps()}"]
+        )
+        last = refinement.trials[-1]
+        made.excursion = refinement.excursion(run if len(run.positions) > 1 else last)
         if made.excursion == 0.0:
             made.time = 0.0
             made.notes.append("nothing moves but by rounding")
-        elif ladder.diverges:
+        elif refinement.diverges:
             made.notes.append("the error in time is unknown: the paths of different steps diverge")
-        elif len(run.positions) < 2 or not (coarser := [one for one in ladder.pilots if one.per_frame < run.per_frame]):
-            made.time = ladder.error
-            if len(ladder.pilots) == 1:
+        elif len(run.positions) < 2 or not (coarser := [one for one in refinement.trials if one.per_frame < run.per_frame]):
+            made.time = refinement.error
+            if len(refinement.trials) == 1:
                 made.notes.append(
                     "the error in time is expected from velocities and nearly equal steps, and may be wrong by a factor of ten"
                 )
         else:
-            made.order, ratio = ladder.order, float(run.per_frame / coarser[-1].per_frame)
-            errors = ladder.error_over_difference(ratio) * distances(run, coarser[-1]).max(axis=0) / made.excursion
+            made.order, ratio = refinement.order, float(run.per_frame / coarser[-1].per_frame)
+            errors = refinement.error_over_difference(ratio) * distances(run, coarser[-1]).max(axis=0) / made.excursion
             for k, body in enumerate(made.bodies.values()):
                 body.time = float(errors[self._frames.bodies == k].max(initial=0.0))
             made.time = float(errors.max())
         return made
 
-    def _add_vibrations(self, estimate: ErrorEstimate, run: Pilot) -> None:
-        """Add to an estimate, of pilots or twins, what implicit steps of bodies that touch do not show."""
-        if self.ladder.pilots[-1].touches and run.integrator == IMPLICIT:
+    def _add_vibrations(self, estimate: ErrorEstimate, run: Trial) -> None:
+        """Add to an estimate, of trials or companions, what implicit steps of bodies that touch do not show."""
+        if self.refinement.trials[-1].touches and run.integrator == IMPLICIT:
             add_vibrations(estimate, self._sim.scene, self._dt(run.per_frame))

@@ -1,7 +1,7 @@
 """Vibrations of bodies in contact that implicit steps pass over.
 
 A body that is set down, or begins to slide, vibrates; friction acts on the vibration, and what it takes from the motion stays.
-Implicit steps above the period of the vibration damp it within a step or two, so that all pilots agree on a path without it:
+Implicit steps above the period of the vibration damp it within a step or two, so that all trials agree on a path without it:
 their differences do not show this error. In `taisoft bench tolerance` it is 1.1 % of the path of a sliding cube and 0.9 % of
 that of a squeezed ball, nearly whatever the step, until steps come near a fiftieth of the period.
 

@@ -1,5 +1,6 @@
 """Springs, tendons and attachments: the elements of a scene, see `spring_table`, and what kernels derive from them."""
 
+import itertools
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,13 +14,9 @@ from taisoft.fem.loads import scalar_loads, tendon_slots
 from taisoft.fem.model import Setup
 from taisoft.fem.node_graph import NodeGraph
 from taisoft.fem.spring_table import LENGTH, MULTIPLIER, PLAIN, SMOOTHED, TENSION, MovingEnds, SpringTable
-from taisoft.scene.body import Body
-from taisoft.scene.connection_records import Attachment, Point
-from taisoft.scene.connections import coincide, locate_nodes, start_of
-from taisoft.scene.locate import locate
+from taisoft.scene.connection_records import Connection
+from taisoft.scene.connections import coincide, lines_of, start_of
 from taisoft.scene.scene import Scene
-
-NOWHERE = (np.zeros(3), None)  # the part of an offset that an end on a body has
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,17 +60,27 @@ def spring_table(scene: Scene, dependents: DependentTable | None = None) -> Spri
         if length is None:
             a, b = (start_of(scene, point) for point in spring.points)
             length = 0.0 if coincide(scene, *spring.points) else float(np.linalg.norm(a - b))
-        made.add(spring.name, [[made.between(*spring.points)]], PLAIN, spring.stiffness, length, spring.damping)
+        made.add(spring.name, _elements(scene, spring), PLAIN, spring.stiffness, length, spring.damping)
     for tendon in scene.tendons:
-        segments = [made.between(p, q) for p, q in zip(tendon.points, tendon.points[1:])]
+        (segments,) = _elements(scene, tendon)
         kind = LENGTH if tendon.is_elastic else MULTIPLIER if tendon.is_inextensible else TENSION
         if kind == TENSION:  # segments between two obstacles move nothing
             segments = [one for one in segments if len(one[0])]
         made.add(tendon.name, [segments], kind, tendon.stiffness or 0.0, slot=slots[tendon.name])
     for attachment in [one for one in scene.attachments if one.stiffness is not None]:
-        lines = [[one] for one in made.attached(attachment)]
-        made.add(attachment.name, lines, PLAIN, attachment.stiffness, damping=attachment.damping)
+        made.add(attachment.name, _elements(scene, attachment), PLAIN, attachment.stiffness, damping=attachment.damping)
     return made.table(dependents)
+
+
+def _elements(scene: Scene, connection: Connection) -> list[list[tuple]]:
+    """The elements of each line of a connection."""
+    return [
+        [
+            (np.concatenate([p.nodes, q.nodes]), np.concatenate([p.weights, -q.weights]), p[2:], q[2:])
+            for p, q in itertools.pairwise(line)
+        ]
+        for line in lines_of(scene, connection)
+    ]
 
 
 class _Builder:
@@ -81,31 +88,7 @@ class _Builder:
 
     def __init__(self, scene: Scene):
         self.scene, self.elements = scene, {}
-        self._starts = scene.first_nodes
         self._entries, self._numbers, self._n_lines = [], [], 0
-
-    def between(self, p: Point, q: Point):
-        """The element between two points."""
-        (nodes_p, weights_p, *at_p), (nodes_q, weights_q, *at_q) = self._side(p), self._side(q)
-        return np.concatenate([nodes_p, nodes_q]), np.concatenate([weights_p, -weights_q]), at_p, at_q
-
-    def attached(self, attachment: Attachment) -> list:
-        """The elements of an attachment."""
-        a, b = self.scene.body(attachment.a), self.scene.collider(attachment.b)
-        own = self._starts[a.name] + attachment.nodes
-        if isinstance(b, Body):
-            nodes, weights = locate_nodes(self.scene, attachment)
-            nodes = nodes + self._starts[b.name]
-            return [(np.append(i, j), np.append(1.0, -w), NOWHERE, NOWHERE) for i, j, w in zip(own, nodes, weights)]
-        places = a.rest_positions[attachment.nodes] + a.position
-        return [(np.array([i]), np.ones(1), NOWHERE, (place, b)) for i, place in zip(own, places)]
-
-    def _side(self, point: Point):
-        owner = self.scene.collider(point.owner)
-        if not isinstance(owner, Body):
-            return np.zeros(0, dtype=np.int64), np.zeros(0), point.position, owner
-        nodes, weights, _ = locate(owner, point.position[None])
-        return self._starts[owner.name] + nodes[0], weights[0], *NOWHERE
 
     def add(
         self,

@@ -21,13 +21,12 @@ import numpy as np
 from taisoft.errors import MeshError, listed, value_text
 from taisoft.files import as_path, replacing
 from taisoft.mesh.abaqus import read_abaqus
-from taisoft.mesh.fibres import FIBRES
 from taisoft.mesh.gmsh import PHYSICAL, element_data, read_gmsh, split_names
 from taisoft.mesh.medit import REFERENCE, read_medit
 from taisoft.mesh.nastran import read_nastran
 from taisoft.mesh.nodes import STRAIGHT
 from taisoft.mesh.quality import edge_lengths
-from taisoft.mesh.regions import LARGEST_ID, usable_names
+from taisoft.mesh.regions import FIBRES, LARGEST_ID, usable_names
 from taisoft.mesh.safe_reading import Blocks, FileContent, content_of, read_by_meshio, read_content
 from taisoft.mesh.surface_mesh import READERS as SURFACE_READERS
 from taisoft.mesh.tet_mesh import LARGEST_COORDINATE, TetMesh

@@ -15,7 +15,7 @@ from meshio._common import num_nodes_per_cell
 from meshio.gmsh import gmsh_to_meshio_type
 
 from taisoft.errors import MeshError
-from taisoft.mesh.fibres import FIBRES
+from taisoft.mesh.regions import FIBRES
 from taisoft.mesh.safe_reading import Blocks, FileContent
 from taisoft.mesh.words import Words, last_line
 

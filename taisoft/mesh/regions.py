@@ -9,6 +9,7 @@ import numpy as np
 from taisoft.errors import MeshError, listed, one_line, value_text
 
 LARGEST_ID = 2**31 - 1  # of a region: mesh files hold 32-bit integers
+FIBRES = ("fibres", "fibers")  # names of cell data in files that hold the directions of fibres
 
 
 def as_array(values, what: str, kinds: str, error: Callable[[str], MeshError]) -> np.ndarray:

@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 
 from taisoft.errors import MeshError, one_line
-from taisoft.mesh.fibres import FIBRES
+from taisoft.mesh.regions import FIBRES
 from taisoft.processes import call, serve
 
 UTF16 = "the file is UTF-16 text; save it as UTF-8"

@@ -1,11 +1,4 @@
-"""Distances from triangles, the inside of closed surfaces, and the overlap depth of two solids; all meant for few queries.
-
-Distances and hits of points, rays and segments are found by brute force (Ericson, Real-Time Collision Detection, 2005, sections
-5.1.5 and 5.1.9; rays: Moeller, Trumbore 1997).
-
-The winding number tells inside from outside: the sum of the triangles' solid angles over 4 pi (van Oosterom, Strackee 1983, The
-solid angle of a plane triangle, IEEE Trans. Biomed. Eng. 30), 1 inside, 0 outside, 2 where two parts of a solid overlap. Edges of
-four triangles and triangles without area do not affect it. Weak: the cost is points times triangles.
+"""The overlap depth of two solids, and points inside of each.
 
 Two solids may overlap though their surfaces cross, coincide in part or wholly, or do not meet. The vertices of each are
 evaluated by exact signed distance from the other's surface. If surfaces coincide, as those of a body and its copy, or cross
@@ -23,76 +16,15 @@ from functools import cached_property
 import numpy as np
 
 from taisoft.errors import MeshError
-from taisoft.mesh.sdf import BallTree, greatest_depth
-from taisoft.mesh.topology import EDGES, TET_FACES, connected_pieces, normals_and_heights, triangle_edges
+from taisoft.mesh.distances import BallTree, are_inside, distances, greatest_depth, is_closed, nearest_hit
+from taisoft.mesh.topology import EDGES, TET_FACES, connected_pieces, normals_and_heights
 
 ALLOWED = 1e-6  # largest depth that is not an overlap, over the smaller solid's size
-EDGE_TOLERANCE = 1e-9  # tolerance in barycentric coordinates, so that no ray passes between adjacent triangles
 PARALLEL = 1e-6  # sine below which two edges count as parallel and give no axis
 EQUAL = 1e-9  # relative size difference that counts as a tie; ties take the first element, independent of rounding
 SHELL = 0.01  # depth of `shell_tets`
-_POINT_PAIRS = 1 << 16  # maximum number of point-triangle pairs processed at once, about 500 bytes each
+_POINT_PAIRS = 1 << 16  # maximum number of point-triangle pairs processed at once, about 1 kB each
 _TET_PAIRS = 1 << 14  # maximum number of triangle-tet pairs processed at once, about 10 kB each
-
-
-def distances(corners: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Return the distances (p,) [m] of points (p,3) from the nearest triangle. corners: (t,3,3) [m]."""
-    edges = np.roll(corners, -1, axis=1) - corners
-    squared = np.einsum("tkx,tkx->tk", edges, edges)
-    normal = np.cross(edges[:, 0], edges[:, 1])
-    length = np.linalg.norm(normal, axis=1)
-    normal /= np.where(length > 0.0, length, 1.0)[:, None]
-    inward = np.cross(normal[:, None], edges)
-    d = points[:, None, None] - corners[None]  # (p,t,3,3), from each corner
-    along = np.einsum("ptkx,tkx->ptk", d, edges) / np.where(squared > 0.0, squared, 1.0)
-    offset = d - np.clip(along, 0.0, 1.0)[..., None] * edges
-    edge_distance = np.sqrt(np.einsum("ptkx,ptkx->ptk", offset, offset)).min(axis=2)
-    inside = (np.einsum("ptkx,tkx->ptk", d, inward) >= 0.0).all(axis=2) & (length > 0.0)
-    plane_distance = np.abs(np.einsum("ptx,tx->pt", d[:, :, 0], normal))
-    return np.where(inside, plane_distance, edge_distance).min(axis=1)
-
-
-def ray_hits(
-    corners: np.ndarray, origin: np.ndarray, direction: np.ndarray, tolerance: float = 0.0
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return where a ray hits each triangle (t,3,3) [m], from both sides: lengths of direction (t,), inf without a hit, and the
-    point's barycentric weights (t,) of the second and the third corner, with their tolerance. Source: Moeller and Trumbore 1997.
-    """
-    e, f, s = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0], origin - corners[:, 0]
-    p, q = np.cross(direction, f), np.cross(s, e)
-    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        inverse = 1.0 / np.einsum("tx,tx->t", e, p)
-        u, v, along = np.einsum("tx,tx->t", s, p) * inverse, q @ direction * inverse, np.einsum("tx,tx->t", f, q) * inverse
-        hits = (u >= -tolerance) & (v >= -tolerance) & (u + v <= 1.0 + tolerance) & (along > 0.0)
-    return np.where(hits, along, np.inf), u, v
-
-
-def nearest_hit(corners: np.ndarray, origin: np.ndarray, direction: np.ndarray) -> float:
-    """Return the distance along a ray, in lengths of direction, to the first triangle hit, inf if none. corners: (t,3,3) [m]."""
-    return float(ray_hits(corners, origin, direction, EDGE_TOLERANCE)[0].min(initial=np.inf))
-
-
-def segment_distance(corners: np.ndarray, a: np.ndarray, b: np.ndarray) -> float:
-    """Return the distance [m] of the segment from a to b, two distinct points (3,), from triangles (t,3,3); 0 if it cuts one."""
-    d = b - a
-    length = np.linalg.norm(d)
-    if nearest_hit(corners, a, d / length) <= length:
-        return 0.0
-    edges = (np.roll(corners, -1, axis=1) - corners).reshape(-1, 3)
-    r = a - corners.reshape(-1, 3)
-    dd, ee, de = d @ d, np.einsum("ex,ex->e", edges, edges), edges @ d
-    dr, er = r @ d, np.einsum("ex,ex->e", edges, r)
-    determinant = dd * ee - de**2
-    s = np.clip(np.where(determinant > 0.0, de * er - dr * ee, 0.0) / np.where(determinant > 0.0, determinant, 1.0), 0.0, 1.0)
-    t = np.clip((de * s + er) / np.where(ee > 0.0, ee, 1.0), 0.0, 1.0)
-    s = np.clip((de * t - dr) / dd, 0.0, 1.0)
-    edge_distance = np.linalg.norm(r + s[:, None] * d - t[:, None] * edges, axis=1).min()
-    return float(min(edge_distance, distances(corners, np.stack([a, b])).min()))
-
-
-def is_closed(triangles: np.ndarray) -> bool:
-    """Return whether a surface (t,3) has no border: each edge is traversed equally often in both directions."""
-    return not triangle_edges(triangles)[2].any()
 
 
 def solid_depths(corners: np.ndarray, points: np.ndarray) -> np.ndarray:
@@ -108,26 +40,6 @@ def solid_depths(corners: np.ndarray, points: np.ndarray) -> np.ndarray:
         if len(inside):
             depth[first + inside] = distances(corners, batch[inside])
     return depth
-
-
-def are_inside(corners: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Return (p,) bool: whether points (p,3) lie inside the solid, see `solid_depths`."""
-    return winding_numbers(corners, points) > (0.5 if _signed_volume6(corners) >= 0.0 else -0.5)
-
-
-def winding_numbers(corners: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Return winding numbers (p,) of points (p,3) for triangles with corners (t,3,3)."""
-    a, b, c = np.moveaxis(corners[None] - points[:, None, None], 2, 0)  # (p,t,3)
-    la, lb, lc = (np.sqrt(np.einsum("ptx,ptx->pt", x, x)) for x in (a, b, c))
-    volume = np.einsum("ptx,ptx->pt", a, np.cross(b, c))
-    ab, bc, ca = (np.einsum("ptx,ptx->pt", x, y) for x, y in ((a, b), (b, c), (c, a)))
-    return np.arctan2(volume, la * lb * lc + ab * lc + bc * la + ca * lb).sum(axis=1) / (2.0 * np.pi)
-
-
-def _signed_volume6(corners: np.ndarray) -> float:
-    """Return six times the enclosed volume [m^3], negative if the normals point inward."""
-    a, b, c = np.moveaxis(corners - corners.reshape(-1, 3).mean(axis=0), 1, 0)
-    return float(np.einsum("tx,tx->", a, np.cross(b, c)))
 
 
 def connected_parts(elements: np.ndarray) -> np.ndarray:

@@ -19,7 +19,7 @@ from taisoft.mesh.obj_off import read_obj, read_off
 from taisoft.mesh.ply import read_ply
 from taisoft.mesh.safe_reading import read_content, run_child
 from taisoft.mesh.stl import read_stl
-from taisoft.mesh.tet_mesh import TetMesh, checked_array, checked_points
+from taisoft.mesh.tet_mesh import TetMesh, checked_cells, checked_points
 from taisoft.mesh.texture import checked_subsets, checked_uvs, subsets_of, transferred
 from taisoft.mesh.topology import Faces, connected_pieces, crack_widths, linked_groups, merged_points, triangle_edges
 from taisoft.scene.checks import instance, number
@@ -52,12 +52,8 @@ class SurfaceMesh:
 
     def __post_init__(self):
         vertices = checked_points(self.vertices, self._error)
-        triangles = checked_array(self.triangles, "triangles", 3, "iu", "integers", self._error)
-        bad = np.argwhere((triangles < 0) | (triangles >= len(vertices)))
-        if len(bad):
-            t, k = bad[0]
-            raise MeshError(f"{self.source}: triangle {t}: vertex {triangles[t, k]} does not exist ({len(vertices)} vertices)")
-        triangles, n = triangles.astype(np.int64), len(triangles)
+        triangles = checked_cells(self.triangles, "triangles", "triangle", 3, len(vertices), self._error)
+        n = len(triangles)
         texture = {"uvs": checked_uvs(self.uvs, n, self._error), "subsets": checked_subsets(self.subsets, n, self._error)}
         self.__dict__.update(vertices=vertices, triangles=triangles, **texture)  # the only way to store values in a frozen record
 

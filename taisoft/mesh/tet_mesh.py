@@ -14,9 +14,8 @@ import numpy as np
 from taisoft.attributes import Guarded, MeshAttributeError
 from taisoft.errors import MeshError, listed
 from taisoft.machine import require
-from taisoft.mesh.fibres import FIBRES, checked_fibres
 from taisoft.mesh.quality import edge_lengths, mean_ratio
-from taisoft.mesh.regions import as_array, checked_names, checked_regions, region_id, region_text
+from taisoft.mesh.regions import FIBRES, as_array, checked_names, checked_regions, region_id, region_text
 from taisoft.mesh.texture import checked_subsets, checked_uvs
 from taisoft.mesh.topology import (
     Faces,
@@ -27,6 +26,7 @@ from taisoft.mesh.topology import (
     joint_vertices,
     merged_points,
 )
+from taisoft.scene.checks import array as checked_numbers
 
 DEGENERATE = 1e-9  # a tet has no volume if it is below this times its longest edge cubed
 NEARLY_FLAT = 0.02  # mean ratio below which a tet causes a warning; grids and common meshers stay above
@@ -60,6 +60,18 @@ def checked_points(points, error: Callable[[str], MeshError], what: str = "verti
             i, k = np.argwhere(bad)[0]
             raise error(f"{one} {i} coordinate {k} {rule.format(array[i, k])}")
     return array
+
+
+def checked_cells(cells, what: str, one: str, width: int, n: int, error: Callable[[str], MeshError]) -> np.ndarray:
+    """Return an (m, width) int64 copy of cells whose corners are among n vertices. error: makes an error of its text."""
+    array = checked_array(cells, what, width, "iu", "integers", error)
+    bad = np.argwhere((array < 0) | (array >= n))
+    if len(bad):
+        text = f"{one} {bad[0, 0]}: vertex {array[tuple(bad[0])]} does not exist ({n} vertices, counted from 0)"
+        if array.min() == 1 and array.max() == n:
+            text += f"; all indices are 1 to {n}: they seem to count from 1, subtract 1"
+        raise error(text)
+    return np.array(array, dtype=np.int64, order="C")
 
 
 class TetMesh(Guarded):
@@ -113,7 +125,7 @@ class TetMesh(Guarded):
         self.regions = checked_regions(regions, self.n_tets, self._mesh_error)
         self.region_ids = () if self.regions is None else tuple(np.unique(self.regions).tolist())
         self.region_names = checked_names(region_names, self.region_ids, self._mesh_error)
-        self.fibres = checked_fibres(fibres, self.n_tets, self._mesh_error)
+        self.fibres = None if fibres is None else checked_numbers(fibres, "fibres", ((self.n_tets, 3),), self._mesh_error)
         self.mid_edge = None if mid_edge is None else checked_points(mid_edge, self._mesh_error, "mid_edge", "mid_edge")
         if mid_edge is not None and len(self.mid_edge) != (n := len(distinct_edges(self.tets)[0])):
             raise self._mesh_error(f"mid_edge has {len(self.mid_edge)} rows for {n} edges")
@@ -228,15 +240,7 @@ class TetMesh(Guarded):
 
     def _checked_tets(self, tets) -> np.ndarray:
         """Return an (m,4) int64 copy: valid indices, no repeated vertex in a tet, no duplicate tet, no unused vertex."""
-        array = checked_array(tets, "tets", 4, "iu", "integers", self._mesh_error)
-        n = self.n_verts
-        bad = np.argwhere((array < 0) | (array >= n))
-        if len(bad):
-            text = f"tet {bad[0, 0]}: vertex {array[tuple(bad[0])]} does not exist ({n} vertices, counted from 0)"
-            if array.min() == 1 and array.max() == n:
-                text += f"; all indices are 1 to {n}: they seem to count from 1, subtract 1"
-            raise self._mesh_error(text)
-        array = np.array(array, dtype=np.int64, order="C")
+        array = checked_cells(tets, "tets", "tet", 4, self.n_verts, self._mesh_error)
         corners = np.sort(array, axis=1)
         twice = (corners[:, 1:] == corners[:, :-1]).any(axis=1)
         if twice.any():
@@ -245,7 +249,7 @@ class TetMesh(Guarded):
         if pair := first_repeated_tet(array):
             corners = tuple(array[pair[0]].tolist())
             raise self._mesh_error(f"tets {pair[0]} and {pair[1]} have the same four vertices {corners}")
-        unused = np.setdiff1d(np.arange(n), array)
+        unused = np.setdiff1d(np.arange(self.n_verts), array)
         if len(unused):
             raise self._mesh_error(f"vertex {unused[0]} belongs to no tet and would have no mass ({len(unused)} such vertices)")
         return array

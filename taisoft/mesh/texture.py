@@ -10,7 +10,7 @@ from collections.abc import Callable
 import numpy as np
 
 from taisoft.errors import MeshError, value_text
-from taisoft.mesh.sdf import Triangles
+from taisoft.mesh.distances import Triangles
 from taisoft.mesh.topology import HALF_EDGES, linked_groups, normals_and_heights
 from taisoft.scene.checks import array
 

@@ -17,6 +17,7 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
+from taisoft.mesh.quality import volume_moments
 from taisoft.mesh.tet_mesh import TetMesh
 from taisoft.mesh.topology import TET_FACES, Faces, connected_pieces
 
@@ -107,21 +108,14 @@ def _exit_points(corners: np.ndarray, direction: np.ndarray) -> tuple[np.ndarray
 
 def _lengths(mesh: TetMesh) -> np.ndarray:
     """Return the length [m] of each surface triangle's part: that of a box with the same largest second moment of volume."""
-    part = connected_pieces(mesh.tets, mesh.n_verts)[1] if mesh.n_components > 1 else np.zeros(mesh.n_verts, dtype=int)
-    tet_part, tets = part[mesh.tets[:, 0]], mesh.tets.T
-    volume = np.bincount(tet_part, mesh.volumes)
-    # Quadrature exact for degree 2: 4/5 of the tet's volume times the value at the centroid plus 1/20 at each corner.
-    corner_weights = sum(np.bincount(corner, mesh.volumes, mesh.n_verts) for corner in tets) / 20.0
-    centroid_weights = 0.8 * mesh.volumes
-    x = mesh.vertices - mesh.vertices.mean(axis=0)  # avoids cancellation far from the origin
-    center = np.stack([np.bincount(part, 5.0 * corner_weights * column) for column in x.T], axis=1) / volume[:, None]
-    x = x - center[part]
-    centroid = sum(x[corner] for corner in tets) / 4.0
-    moments = np.empty((len(volume), 3, 3))
-    for i, j in np.ndindex(3, 3):
-        moments[:, i, j] = np.bincount(part, corner_weights * x[:, i] * x[:, j])
-        moments[:, i, j] += np.bincount(tet_part, centroid_weights * centroid[:, i] * centroid[:, j])
-    return np.sqrt(12.0 * np.linalg.eigvalsh(moments / volume[:, None, None])[:, -1])[part[mesh.surface[:, 0]]]
+    part = connected_pieces(mesh.tets, mesh.n_verts)[1][mesh.surface[:, 0]]
+    lengths = np.empty(len(part))
+    order = np.argsort(part, kind="stable")
+    for own in np.split(order, np.cumsum(np.bincount(part))[:-1]):
+        used, triangles = np.unique(mesh.surface[own], return_inverse=True)
+        covariance = volume_moments(mesh.vertices[used], triangles.reshape(-1, 3))[2]
+        lengths[own] = np.sqrt(12.0 * np.linalg.eigvalsh(covariance)[-1])
+    return lengths
 
 
 def _median(values: np.ndarray, weights: np.ndarray) -> float:

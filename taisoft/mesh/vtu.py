@@ -20,7 +20,7 @@ from meshio._common import num_nodes_per_cell
 from meshio._vtk_common import vtk_to_meshio_type
 
 from taisoft.errors import MeshError
-from taisoft.mesh.fibres import FIBRES
+from taisoft.mesh.regions import FIBRES
 from taisoft.mesh.safe_reading import MAX_ENTRIES_PER_BYTE, Blocks, FileContent
 from taisoft.mesh.words import Words
 

@@ -127,7 +127,7 @@ def obstacle_surfaces(scene) -> list[ObstacleSurface]:
             surface = _square(shape, middle, half_side, others)
         elif isinstance(shape, (Sphere, Capsule)):
             half_length = shape.size()[0] if isinstance(shape, Capsule) else 0.0
-            local, triangles = _capsule(half_length, shape.radius)
+            local, triangles = capsule(half_length, shape.radius)
             surface = local @ shape.frame().T + shape.pivot, triangles
         else:
             vertices, triangles = shape.surface()
@@ -162,20 +162,23 @@ def _square(shape: HalfSpace, middle: np.ndarray, half_side: float, others: list
     return points, triangles
 
 
-def _capsule(half_length: float, radius: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return vertices and triangles of a capsule along x about the origin; a sphere if half_length is 0."""
-    latitude = np.linspace(0.0, np.pi / 2, ALONG + 1)[:-1]
+def capsule(half_length: float, radius: float, around: int = AROUND, along: int = ALONG) -> tuple[np.ndarray, np.ndarray]:
+    """Return vertices and triangles of a capsule along x about the origin; a sphere if half_length is 0.
+
+    around, along: facets around its axis, and from the equator to a pole.
+    """
+    latitude = np.linspace(0.0, np.pi / 2, along + 1)[:-1]
     lower = np.stack([-half_length - radius * np.sin(latitude), radius * np.cos(latitude)], axis=1)[::-1]
     upper = np.stack([half_length + radius * np.sin(latitude), radius * np.cos(latitude)], axis=1)
     rings = np.concatenate([lower, upper if half_length > 0 else upper[1:]])  # coordinate along x, distance from the axis
-    angle = np.linspace(0.0, 2 * np.pi, AROUND, endpoint=False)
+    angle = np.linspace(0.0, 2 * np.pi, around, endpoint=False)
     x = np.stack(np.broadcast_arrays(rings[:, :1], rings[:, 1:] * np.cos(angle), rings[:, 1:] * np.sin(angle)), axis=2)
     points = np.concatenate([x.reshape(-1, 3), [[-half_length - radius, 0, 0], [half_length + radius, 0, 0]]])
-    k, following = np.arange(AROUND), np.roll(np.arange(AROUND), -1)
-    top, pole = AROUND * (len(rings) - 1), np.full(AROUND, AROUND * len(rings))
+    k, following = np.arange(around), np.roll(np.arange(around), -1)
+    top, pole = around * (len(rings) - 1), np.full(around, around * len(rings))
     corners = []
-    for a in range(0, top, AROUND):
-        b = a + AROUND
+    for a in range(0, top, around):
+        b = a + around
         corners += [(a + k, a + following, b + k), (b + k, a + following, b + following)]
     corners += [(pole, following, k), (pole + 1, top + k, top + following)]
     return points, np.array(corners).transpose(0, 2, 1).reshape(-1, 3)

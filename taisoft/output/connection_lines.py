@@ -9,10 +9,8 @@ import numpy as np
 import scipy.sparse as sp
 
 from taisoft.errors import OutputError, SceneError, reworded
-from taisoft.scene.body import Body
-from taisoft.scene.connection_records import Attachment, Connection, Point
-from taisoft.scene.connections import locate_nodes
-from taisoft.scene.locate import locate
+from taisoft.scene.connection_records import Connection
+from taisoft.scene.connections import End, lines_of
 
 if TYPE_CHECKING:
     from taisoft.scene.scene import Scene
@@ -25,50 +23,18 @@ class ConnectionLines:
     """
 
     def __init__(self, scene: "Scene", connections: list[Connection]):
-        self._first, self._rows = scene.first_nodes, []
-        self._n_nodes, self._scene = sum(body.n_nodes for body in scene.bodies), scene
-        self._on_obstacles: dict[str, tuple[list[int], list[np.ndarray]]] = {}
-        self.names, self.lines, counts = [one.name for one in connections], [], []
-        for one in connections:
-            added = self._add_attachment(one) if isinstance(one, Attachment) else [self._add_points(one.points)]
-            self.lines.append(slice(len(counts), len(counts) + len(added)))
-            counts += added
-        self.start = np.cumsum([0, *counts])
-        nodes, weights = zip(*self._rows) if self._rows else ((), ())
-        indices = np.concatenate([np.zeros(0, dtype=np.int64), *nodes])
-        start = np.cumsum([0, *map(len, nodes)])
-        self._matrix = sp.csr_matrix((np.concatenate([np.zeros(0), *weights]), indices, start), (len(nodes), self._n_nodes))
-        self._placed = [
-            (obstacle := scene.obstacle(name), np.array(rows), obstacle.undisplaced(np.array(points)))
-            for name, (rows, points) in self._on_obstacles.items()
-        ]
-
-    def _add_points(self, points: tuple[Point, ...]) -> int:
-        for point in points:
-            owner = self._scene.collider(point.owner)
-            if isinstance(owner, Body):
-                nodes, weights, _ = locate(owner, point.position[None])
-                self._rows.append((self._first[owner.name] + nodes[0], weights[0]))
-            else:
-                self._add_on_obstacle(owner.name, point.position)
-        return len(points)
-
-    def _add_attachment(self, one: Attachment) -> list[int]:
-        a, owner = self._scene.body(one.a), self._scene.collider(one.b)
-        inside = locate_nodes(self._scene, one) if isinstance(owner, Body) else None
-        for k, node in enumerate(one.nodes):
-            self._rows.append((np.array([self._first[a.name] + node]), np.ones(1)))
-            if inside is None:
-                self._add_on_obstacle(owner.name, a.rest_positions[node] + a.position)
-            else:
-                self._rows.append((self._first[owner.name] + inside[0][k], inside[1][k]))
-        return [2] * len(one.nodes)
-
-    def _add_on_obstacle(self, name: str, position: np.ndarray) -> None:
-        rows, points = self._on_obstacles.setdefault(name, ([], []))
-        rows.append(len(self._rows))
-        points.append(position)
-        self._rows.append((np.zeros(0, dtype=np.int64), np.zeros(0)))
+        self.names, lines = [one.name for one in connections], [lines_of(scene, one) for one in connections]
+        first = np.cumsum([0, *map(len, lines)])
+        self.lines = [slice(*pair) for pair in zip(first, first[1:])]
+        lines = [line for of_one in lines for line in of_one]
+        self.start, ends = np.cumsum([0, *map(len, lines)]), [end for line in lines for end in line]
+        nodes, weights = (np.concatenate([End()[k], *(end[k] for end in ends)]) for k in (0, 1))
+        shape = len(ends), sum(body.n_nodes for body in scene.bodies)
+        self._matrix = sp.csr_matrix((weights, nodes, np.cumsum([0, *(len(end.nodes) for end in ends)])), shape)
+        self._placed = []
+        for obstacle in {end.obstacle.name: end.obstacle for end in ends if end.obstacle is not None}.values():
+            rows = np.array([row for row, end in enumerate(ends) if end.obstacle is obstacle])
+            self._placed.append((obstacle, rows, obstacle.undisplaced(np.array([ends[row].point for row in rows]))))
 
     def points(self, x: np.ndarray, t: float) -> np.ndarray:
         """All points (n,3) [m] of node positions x (n_nodes,3) at time t [s]. Raises OutputError if an obstacle's path fails."""

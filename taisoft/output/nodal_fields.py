@@ -16,9 +16,9 @@ import scipy.sparse as sp
 
 from taisoft.fem.reference import inverse_rest_edges
 from taisoft.scene.rigid import RigidBody
+from taisoft.view.choices import COLOURS
 
 VECTORS = ("traction", "slip")  # of `ContactPressure`
-OF_CONTACTS = {"pressure": "pressure", "slip": "accumulated_slip"}  # quantity -> field of `ContactPressure`
 UNKNOWN_ERROR = -1.0  # in files, of nodes whose error is unknown
 
 
@@ -86,7 +86,7 @@ def von_mises(sigma: np.ndarray) -> np.ndarray:
 
 
 class NodalValues:
-    """A quantity at the nodes of all bodies. bodies: of the scene, in the order added.
+    """Quantities at the nodes of all bodies (n_nodes,) in a simulator's present state. bodies: of the scene, in the order added.
 
     by_step: stress is computed once a step, for several writers of one run.
     """
@@ -96,17 +96,34 @@ class NodalValues:
         self._rigid = np.concatenate([np.full(body.n_nodes, isinstance(body, RigidBody)) for body in bodies])
 
     def __call__(self, kind: str, sim) -> np.ndarray:
-        """Return the quantity, such as "stress" or "speed", at all nodes (n_nodes,) in sim's present state."""
-        if kind == "stress":
-            if not self._by_step or self._stress[0] != sim.step_count:
-                found = von_mises(self._mean(sim.stress()))
-                self._stress = sim.step_count, np.where(self._rigid, np.nan, found)  # a rigid body's tet is not its material
-            return self._stress[1]
-        if kind == "error":
-            return sim.nodal_errors()
-        if kind in OF_CONTACTS:
-            return surface_values(sim, OF_CONTACTS[kind])[0]
-        return self._mean(self._stretches(sim)) if kind == "stretch" else np.linalg.norm(sim.velocities(), axis=1)
+        """Return one of `taisoft.view.choices.COLOURS` that has values."""
+        return COLOURS[kind].value(self, sim)
+
+    def stress(self, sim) -> np.ndarray:
+        """Return the von Mises stress [Pa] of the mean stress, NaN in rigid bodies, whose tet is not their material."""
+        if not self._by_step or self._stress[0] != sim.step_count:
+            found = von_mises(self._mean(sim.stress()))
+            self._stress = sim.step_count, np.where(self._rigid, np.nan, found)
+        return self._stress[1]
+
+    def stretch(self, sim) -> np.ndarray:
+        """Return the mean of the largest principal stretch; for quadratic tets that of the linear tet of the corners."""
+        parts = []
+        for body, Dm_inv in zip(self._bodies, self._Dm_inv):
+            corner = sim.positions(body.name)[body.mesh.tets]
+            F = (corner[:, 1:] - corner[:, :1]).transpose(0, 2, 1) @ Dm_inv
+            parts.append(np.sqrt(np.linalg.eigvalsh(F.transpose(0, 2, 1) @ F)[:, 2]))
+        return self._mean(np.concatenate(parts))
+
+    @staticmethod
+    def speed(sim) -> np.ndarray:
+        """Return the speed [m/s]."""
+        return np.linalg.norm(sim.velocities(), axis=1)
+
+    @staticmethod
+    def touching(sim, field: str) -> np.ndarray:
+        """Return a field of `ContactPressure`."""
+        return surface_values(sim, field)[0]
 
     @cached_property
     def _mean(self) -> NodalMean:
@@ -115,12 +132,3 @@ class NodalValues:
     @cached_property
     def _Dm_inv(self) -> list[np.ndarray]:
         return [inverse_rest_edges(b.mesh.vertices, b.mesh.tets)[0] for b in self._bodies]
-
-    def _stretches(self, sim) -> np.ndarray:
-        """Return the largest principal stretch of every tet (m,); for quadratic tets that of the linear tet of the corners."""
-        parts = []
-        for body, Dm_inv in zip(self._bodies, self._Dm_inv):
-            corner = sim.positions(body.name)[body.mesh.tets]
-            F = (corner[:, 1:] - corner[:, :1]).transpose(0, 2, 1) @ Dm_inv
-            parts.append(np.sqrt(np.linalg.eigvalsh(F.transpose(0, 2, 1) @ F)[:, 2]))
-        return np.concatenate(parts)

@@ -23,7 +23,6 @@ LEAST_SLOPE = 0.1  # cosine between a ground's normal and the vertical; a steepe
 WHOLE = (0.0, 0.0, 1.0, 1.0)  # left, bottom, right and top of a picture, of which a part may be free
 DIRECTIONS = np.array([d for d in itertools.product((-1.0, 0.0, 1.0), repeat=3) if any(d)])  # (26,3); unit vectors from here on
 DIRECTIONS /= np.linalg.norm(DIRECTIONS, axis=1, keepdims=True)
-GUARD_BAND = 50.0  # half-size of the clipping region in half-sizes of the picture; triangles that cross it are cut
 NEAR, FAR = 0.02, 50.0  # clipping planes in units of the distance to the target
 
 
@@ -89,17 +88,17 @@ def camera_viewpoint(scene, t: float, x: np.ndarray) -> "Viewpoint | None":
     return Viewpoint(**at)
 
 
-def clip_polygon(polygon: np.ndarray, k: int = 0) -> np.ndarray:
+def clip_polygon(polygon: np.ndarray) -> np.ndarray:
     """Clip a convex polygon to the side of a plane where the height is not negative (Sutherland and Hodgman 1974).
 
-    polygon: (n,m), one row per corner; column k is the height above the plane; all columns are interpolated.
+    polygon: (n,m), one row per corner; the first column is the height above the plane; all columns are interpolated.
     """
     kept = []
     for a, b in zip(polygon, np.roll(polygon, -1, axis=0)):
-        if a[k] >= 0:
+        if a[0] >= 0:
             kept.append(a)
-        if a[k] * b[k] < 0:
-            kept.append(a + a[k] / (a[k] - b[k]) * (b - a))
+        if a[0] * b[0] < 0:
+            kept.append(a + a[0] / (a[0] - b[0]) * (b - a))
     return np.array(kept).reshape(-1, polygon.shape[1])
 
 
@@ -193,34 +192,25 @@ class Viewpoint:
         low, high = 2.0 * self.slope * (np.reshape(free, (2, 2)) - 0.5) * (size[0] / size[1], 1.0)
         return (low + high) / 2, fraction * (high - low) / 2
 
-    def clipped(
-        self, x: np.ndarray, triangles: np.ndarray, attributes: np.ndarray, size: tuple[int, int]
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Clip vertices x (n,3) [m], triangles (t,3) and attributes (n,k) at the near plane and the guard band.
+    def clipped(self, x: np.ndarray, triangles: np.ndarray, attributes: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Clip vertices x (n,3) [m], triangles (t,3) and attributes (n,k) at the near plane.
 
-        size: width and height of the picture. New vertices follow the given ones; triangles that are not finite are dropped.
+        New vertices follow the given ones; triangles that are not finite are dropped.
         """
         with np.errstate(invalid="ignore", over="ignore"):
-            right, up, depth = self.axes @ (x - self.position).T
-            half_height = GUARD_BAND * self.slope * depth
-            half_width = half_height * size[0] / size[1]
-            near = depth - self.clipping[0] * (1.0 + 1e-6)
-            inside = np.stack([near, half_width - right, half_width + right, half_height - up, half_height + up])
-            outside = ~((inside > 0.0) & (inside < np.inf)).all(axis=0)  # of some plane's inner side, or not finite
+            inside = (x - self.position) @ self.forward - self.clipping[0] * (1.0 + 1e-6)
+            outside = ~((inside > 0.0) & np.isfinite(x).all(axis=1))
         if not outside.any():
             return x, triangles, attributes
-        inside, touched = inside.T, outside[triangles].any(axis=1)
+        touched = outside[triangles].any(axis=1)
         whole, cut = triangles[~touched], triangles[touched]
-        within = inside[cut] > 0.0  # (t, corners, planes)
-        crossing = within.any(axis=1).all(axis=1) & np.isfinite(inside[cut]).all(axis=(1, 2))
+        crossing = (inside[cut] > 0.0).any(axis=1) & np.isfinite(x[cut]).all(axis=(1, 2))
         faces, points = [], []
         for corners in cut[crossing]:
-            polygon = np.concatenate([inside[corners], x[corners], attributes[corners]], axis=1)
-            for k in range(inside.shape[1]):
-                polygon = clip_polygon(polygon, k)
+            polygon = clip_polygon(np.column_stack([inside[corners], x[corners], attributes[corners]]))
             first = len(x) + len(points)
             faces += [(first, first + k, first + k + 1) for k in range(1, len(polygon) - 1)]
-            points += [row[inside.shape[1] :] for row in polygon]
+            points += list(polygon[:, 1:])
         if not faces:
             return x, whole, attributes
         new = np.array(points)

@@ -6,14 +6,14 @@ by its position at the start. Each function whose first argument is `self` is a 
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from taisoft.errors import SceneError, reworded
 from taisoft.scene import checks
 from taisoft.scene.body import Body, Constraint
-from taisoft.scene.connection_records import MAX_OUTSIDE, Attachment, Point, Spring, Tendon
+from taisoft.scene.connection_records import MAX_OUTSIDE, Attachment, Connection, Point, Spring, Tendon
 from taisoft.scene.loads import either, value_or_path
 from taisoft.scene.locate import locate
 from taisoft.scene.obstacles import Obstacle
@@ -197,6 +197,36 @@ def locate_nodes(scene: "Scene", attachment: Attachment) -> tuple[np.ndarray, np
 
     _check_outside(outside, label, b, attachment.reach)
     return nodes, weights
+
+
+class End(NamedTuple):
+    """Where a line of a connection ends or turns: at the sum of nodes (k,) of the scene times weights (k,), or at a point (3,)
+    [m] that an obstacle has at the start."""
+
+    nodes: np.ndarray = np.zeros(0, dtype=np.int64)
+    weights: np.ndarray = np.zeros(0)
+    point: np.ndarray = np.zeros(3)
+    obstacle: Obstacle | None = None
+
+
+def lines_of(scene: "Scene", connection: Connection) -> list[list[End]]:
+    """Return the lines of a connection: one through the points of a spring or tendon, one for each node of an attachment."""
+    if not isinstance(connection, Attachment):
+        return [[_end(scene, point) for point in connection.points]]
+    starts, a, b = scene.first_nodes, scene.body(connection.a), scene.collider(connection.b)
+    if isinstance(b, Body):
+        places = [End(starts[b.name] + nodes, weights) for nodes, weights in zip(*locate_nodes(scene, connection))]
+    else:
+        places = [End(point=point, obstacle=b) for point in a.rest_positions[connection.nodes] + a.position]
+    return [[End(starts[a.name] + np.array([node]), np.ones(1)), place] for node, place in zip(connection.nodes, places)]
+
+
+def _end(scene: "Scene", point: Point) -> End:
+    owner = scene.collider(point.owner)
+    if not isinstance(owner, Body):
+        return End(point=point.position, obstacle=owner)
+    nodes, weights, _ = locate(owner, point.position[None])
+    return End(scene.first_nodes[owner.name] + nodes[0], weights[0])
 
 
 def coincide(scene: "Scene", p: Point, q: Point) -> bool:

@@ -16,8 +16,8 @@ import numpy as np
 
 from taisoft.errors import SceneError, value_text
 from taisoft.mesh import quadratic
+from taisoft.mesh.distances import Triangles
 from taisoft.mesh.nodes import PARTS, Nodes
-from taisoft.mesh.sdf import nearest_points
 from taisoft.mesh.surface_mesh import SurfaceMesh
 from taisoft.mesh.tet_mesh import TetMesh
 from taisoft.mesh.topology import HALF_EDGES, distinct_edges, linked_groups, normals_and_heights, triangle_edges
@@ -74,7 +74,7 @@ def check_shape(what: str, nodes: Nodes) -> None:
 def _nearest(curve: Sphere | Capsule | SurfaceMesh, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the nearest points (p,3) [m] of a shape's surface, and its unit normals there, to points (p,3)."""
     if isinstance(curve, SurfaceMesh):
-        nearest, triangle = nearest_points(curve.vertices, curve.triangles, points)
+        nearest, triangle = Triangles(curve.vertices, curve.triangles).closest(points)
         return nearest, normals_and_heights(curve.vertices, curve.triangles)[0][triangle]
     if isinstance(curve, Sphere):
         centre = curve.center

@@ -13,7 +13,7 @@ import numpy as np
 
 from taisoft.attributes import guarded_record
 from taisoft.errors import SceneError, SimulationError, reworded
-from taisoft.mesh.solids import is_closed
+from taisoft.mesh.distances import is_closed
 from taisoft.scene import checks
 from taisoft.scene.key_frames import KeyFrames
 

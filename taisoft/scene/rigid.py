@@ -18,7 +18,8 @@ import scipy.sparse as sp
 from taisoft.attributes import thawed
 from taisoft.errors import SceneError
 from taisoft.mesh import nodes as mesh_nodes
-from taisoft.mesh.solids import are_inside, distances
+from taisoft.mesh.distances import are_inside, distances
+from taisoft.mesh.quality import volume_moments
 from taisoft.mesh.surface_mesh import SurfaceMesh, as_surface
 from taisoft.mesh.tet_mesh import TetMesh
 from taisoft.scene import checks
@@ -294,18 +295,3 @@ def checked_surface(mesh: TetMesh | SurfaceMesh, what: str) -> SurfaceMesh:
     if faults:
         raise SceneError(f"{what}: its surface does not bound a solid: {faults[0]}")
     return mesh
-
-
-def volume_moments(vertices: np.ndarray, triangles: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
-    """Volume [m^3], centre (3,) [m] and covariance (3,3) [m^2] about it of the solid in a closed surface, normals outward.
-
-    Each triangle (a, b, c) adds the tet (o, a, b, c), whose integral of x x^T is V/20 (a a^T + b b^T + c c^T + s s^T) about o,
-    with s = a + b + c.
-    """
-    origin = vertices.mean(axis=0)
-    x = vertices[triangles] - origin
-    volumes, total = np.linalg.det(x) / 6.0, x.sum(axis=1)
-    volume = volumes.sum()
-    centre = 0.25 * volumes @ total / volume
-    second = (np.einsum("t,tki,tkj->ij", volumes, x, x) + np.einsum("t,ti,tj->ij", volumes, total, total)) / (20.0 * volume)
-    return float(volume), origin + centre, second - np.outer(centre, centre)

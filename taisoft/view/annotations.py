@@ -10,9 +10,10 @@ from importlib.util import find_spec
 import numpy as np
 
 from taisoft.errors import OutputError
-from taisoft.view.colouring import TITLES, Colouring, colours_of, round_up
+from taisoft.view.choices import COLOURS, Plot
+from taisoft.view.colouring import Colouring, colours_of, round_up
 from taisoft.view.drawn import DrawnState
-from taisoft.view.plots import Plot, PlotChoice, series_of
+from taisoft.view.plots import PlotChoice, series_of
 
 HEIGHT, INCH = 720.0, 72.0
 MARGIN, WIDTH, PLOT_HEIGHT = 16, 300, 134  # around everything; of the plots, lower if there are more than five
@@ -122,7 +123,7 @@ class Annotations:
         (width, height), bottom = BAR, bottom + TEXT_SIZE
         colours, place = colours_of(np.linspace(0.0, 1.0, width)), (MARGIN, MARGIN + width, bottom, bottom + height)
         self._axes.imshow(colours[None], aspect="auto", extent=place, zorder=2)
-        self._write((MARGIN, bottom + height + 4), TITLES[self._colouring.kind], TEXT_SIZE)
+        self._write((MARGIN, bottom + height + 4), COLOURS[self._colouring.kind].title, TEXT_SIZE)
         for text, fraction, side in zip(texts, (0.0, 0.5, 1.0), ("left", "center", "right")):
             self._write((MARGIN + fraction * width, bottom - 3), text, SMALL_SIZE, align=f"{side} top")
 

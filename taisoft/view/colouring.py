@@ -20,27 +20,15 @@ from taisoft.errors import OutputError
 from taisoft.mesh.placing import UP
 from taisoft.output.viewpoint import Viewpoint
 from taisoft.scene.checks import choice
+from taisoft.view.choices import COLOURS, NODAL
 from taisoft.view.drawn import DrawnState
 
-UNITS = {"body": "", "stress": "Pa", "stretch": "", "speed": "m/s", "pressure": "Pa", "slip": "m", "error": "m"}
-TITLES = {
-    "body": "own colour",
-    "stress": "von Mises stress",
-    "stretch": "largest stretch",
-    "speed": "speed",
-    "pressure": "contact pressure",
-    "slip": "accumulated slip",
-    "error": "estimated error",
-}
 QUANTILE = 0.99  # fraction of the nodes whose values lie within the scale
 DECAY = 0.998  # factor on the running maximum per picture
 LOWER_MARGIN = 1.5  # the end is lowered once this times the running maximum, rounded up, is below it
-POSITIVE = ("pressure", "slip")  # of which nodes without any do not count
-# smallest span of the scale, for a scene at rest
-MIN_SPAN = {"stress": 1.0, "stretch": 1e-3, "speed": 1e-3, "pressure": 1.0, "slip": 1e-12, "error": 1e-12}
 # sRGB, from low to high
 UNKNOWN = np.array([0.55, 0.55, 0.55])  # where the quantity is unknown
-COLOURS = np.array([(0.27, 0.42, 0.80), (0.33, 0.70, 0.78), (0.72, 0.82, 0.45), (0.97, 0.70, 0.27), (0.82, 0.20, 0.17)])
+GRADIENT = np.array([(0.27, 0.42, 0.80), (0.33, 0.70, 0.78), (0.72, 0.82, 0.45), (0.97, 0.70, 0.27), (0.82, 0.20, 0.17)])
 
 LAMPS = ((np.array([-0.35, 0.60, 0.72]), 0.72), (np.array([0.85, 0.15, 0.45]), 0.22))  # direction (right, up, back), strength
 SKY, GROUND = np.array([0.44, 0.46, 0.49]), np.array([0.26, 0.25, 0.24])
@@ -49,12 +37,12 @@ BACKGROUND = np.array([(0.95, 0.955, 0.96), (0.80, 0.81, 0.82)])  # sRGB, at the
 
 
 def checked_colour(kind: str) -> str:
-    """Return the name of a colouring. Raises OutputError unless it is one of UNITS."""
-    return choice(kind, "colour", tuple(UNITS), OutputError)
+    """Return the name of a colouring. Raises OutputError unless it is one of COLOURS."""
+    return choice(kind, "colour", tuple(COLOURS), OutputError)
 
 
 class Colouring:
-    """Unshaded colours of the drawn vertices of `Surfaces`, by one of UNITS. Raises OutputError for another name."""
+    """Unshaded colours of the drawn vertices of `Surfaces`, by one of COLOURS. Raises OutputError for another name."""
 
     def __init__(self, surfaces, kind: str = "body"):
         self._surfaces = surfaces
@@ -63,7 +51,7 @@ class Colouring:
 
     def choose(self, kind: str) -> None:
         """Colour by another quantity, with a scale of its own."""
-        self.kind = checked_colour(kind)
+        self.kind, self._colour = checked_colour(kind), COLOURS[kind]
         self._peak, self.span, self._is_fixed = 0.0, 0.0, False
 
     @property
@@ -78,9 +66,9 @@ class Colouring:
 
     def fix(self, states: Iterable[DrawnState], end: float | None = None) -> None:
         """Keep one scale from now on, up to this end, or for the largest values in these states."""
-        if self.kind != "body":
-            largest = max(MIN_SPAN[self.kind], *(self._largest(self._above(state)) for state in states)) if end is None else 0.0
-            self.span, self._is_fixed = round_up(largest) if end is None else end - self.low, True
+        if self.kind in NODAL:
+            largest = (self._largest(self._above(state)) for state in states if end is None)
+            self.span, self._is_fixed = round_up(max(self._colour.least_span, *largest)) if end is None else end - self.low, True
 
     def _above(self, state: DrawnState) -> np.ndarray:
         """Return a state's values (n,) above the scale's lower end."""
@@ -88,24 +76,24 @@ class Colouring:
 
     def _largest(self, above: np.ndarray) -> float:
         """Return the quantile of values (n,) above the scale's lower end."""
-        finite = above[np.isfinite(above) & ((above > 0.0) | (self.kind not in POSITIVE))]
+        finite = above[np.isfinite(above) & ((above > 0.0) | (not self._colour.skips_zero))]
         return float(np.quantile(finite, QUANTILE)) if len(finite) else 0.0
 
     def choose_next(self) -> None:
-        """Colour by the next of UNITS; by the error only if that was the first choice, since it needs a run with error=True."""
-        self.choose(following(tuple(kind for kind in UNITS if kind != "error" or self._has_errors), self.kind))
+        """Colour by the next of COLOURS; by the error only if that was the first choice, since it needs a run with error=True."""
+        self.choose(following(tuple(kind for kind in COLOURS if kind != "error" or self._has_errors), self.kind))
 
     @property
     def low(self) -> float:
         """Lower end of the scale."""
-        return 1.0 if self.kind == "stretch" else 0.0
+        return self._colour.low
 
     def base(self, state: DrawnState) -> np.ndarray:
         """Return unshaded colours (n,3) of all drawn vertices, sRGB; the bodies' own as long as the quantity is not known."""
         if self.kind not in state.values:
             return self._surfaces.colours
         above = self._above(state)
-        self._peak = max(self._largest(above), DECAY * self._peak, MIN_SPAN[self.kind])
+        self._peak = max(self._largest(above), DECAY * self._peak, self._colour.least_span)
         if not self._is_fixed and (self._peak > self.span or round_up(LOWER_MARGIN * self._peak) < self.span):
             self.span = round_up(self._peak)
         colours = colours_of(np.nan_to_num(above / self.span))
@@ -115,14 +103,15 @@ class Colouring:
     @property
     def scale_text(self) -> str:
         """The quantity and what red means, as in "speed, red: 2 m/s or more"; empty for the bodies' own colours."""
-        return "" if self.kind == "body" else f"{TITLES[self.kind]}, red: {self.low + self.span:g} {UNITS[self.kind]} or more"
+        unit = self._colour.unit
+        return "" if self.kind == "body" else f"{self._colour.title}, red: {self.low + self.span:g} {unit} or more"
 
     def legend(self) -> list[tuple[str, np.ndarray]]:
         """Return lines of text from high to low, each with its colour (3,); none for the bodies' own colours."""
         if self.kind == "body" or self.span == 0.0:
             return []
         fractions = np.linspace(1.0, 0.0, 3)
-        texts = [f"{self.low + fraction * self.span:10.4g} {UNITS[self.kind]}" for fraction in fractions]
+        texts = [f"{self.low + fraction * self.span:10.4g} {self._colour.unit}" for fraction in fractions]
         return list(zip(texts, colours_of(fractions)))
 
 
@@ -133,8 +122,8 @@ def following(names: tuple[str, ...], name: str) -> str:
 
 def colours_of(fractions: np.ndarray) -> np.ndarray:
     """Return sRGB colours (n,3) of fractions (n,) of the scale, clamped to [0, 1]."""
-    knots = np.linspace(0.0, 1.0, len(COLOURS))
-    return np.column_stack([np.interp(fractions, knots, COLOURS[:, k]) for k in range(3)])
+    knots = np.linspace(0.0, 1.0, len(GRADIENT))
+    return np.column_stack([np.interp(fractions, knots, GRADIENT[:, k]) for k in range(3)])
 
 
 def round_up(value: float) -> float:

@@ -18,7 +18,6 @@ from taisoft.scene.look import Camera, Light
 from taisoft.scene.obstacles import Box, Capsule, HalfSpace, MeshObstacle, Obstacle, Sphere
 
 SHAPES = {shape.__name__: shape for shape in (HalfSpace, Sphere, Box, Capsule, MeshObstacle)}
-ENERGIES = ("kinetic", "elastic", "gravity")  # [J]
 MAX_MARKERS = 500  # per body; of more fixed nodes, evenly selected ones are shown
 MAX_CROSSES, MAX_ARROWS, MAX_LOAD_ARROWS = 150, 40, 60  # of an attachment; of a pressure; of a traction
 PRESSURE_ARROW, IN_CHANNEL = 0.07, 0.4  # longest arrow over the scene's size, and over the middle extent of the pressed surface
@@ -160,7 +159,7 @@ class DrawnScene:
 class DrawnState:
     """A scene at one moment.
 
-    displacement (n,3) [m], float32, of all nodes since the start; values: quantities of `taisoft.view.colouring.UNITS` at the
+    displacement (n,3) [m], float32, of all nodes since the start; values: quantities of `taisoft.view.choices.COLOURS` at the
     nodes (n,); energies [J]; poses: of the obstacles that move, translation (3,) [m] and rotation (3,3) by name; tractions (3,)
     [Pa] and pressures [Pa], in the scene's order; segments: ends (k,2,3) [m] and tensions (k,) [N] of springs and tendons;
     contacts: point (k,3) [m], normal and impulse (k,3) [N s] by name. What nothing draws is empty.

@@ -12,9 +12,10 @@ from taisoft.backend.runtime import open_kind, open_runtime
 from taisoft.errors import OutputError, value_text
 from taisoft.output.viewpoint import Viewpoint
 from taisoft.scene.look import Camera
+from taisoft.view.choices import IN_PICTURES
 from taisoft.view.colouring import background
 from taisoft.view.raster import Raster
-from taisoft.view.scene_view import IN_PICTURES, SceneView
+from taisoft.view.scene_view import SceneView
 from taisoft.view.shading import N_ATTRIBUTES, SAMPLES
 from taisoft.view.shadow import Shadows
 
@@ -72,15 +73,11 @@ class Offscreen(SceneView):
             *target, distance = kept["camera"]
             self.camera = replace(self.camera, target=np.array(target), distance=distance)
         self.colouring.resume(*kept.get("scale", self.colouring.scale))
-        self.layers.peak = float(kept.get("impulse", 0.0))
-        self.layers.connections.peak = float(kept.get("tension", 0.0))
-        self.layers.pressures.peak = float(kept.get("pressure", 0.0))
+        self.layers.peaks |= {name: float(kept.get(name, 0.0)) for name in self.layers.peaks}
 
     def _present(self) -> dict:
-        layers = self.layers
-        peaks = {"impulse": layers.peak, "tension": layers.connections.peak, "pressure": layers.pressures.peak}
         camera = None if self._has_own else [*self.camera.target.tolist(), self.camera.distance]
-        return {"camera": camera, "scale": list(self.colouring.scale)} | peaks
+        return {"camera": camera, "scale": list(self.colouring.scale)} | self.layers.peaks
 
     def image(self, sim) -> np.ndarray:
         """Return a picture of a `DrawnState`, or of a simulator's present state, uint8 (height, width, 3), first row on top.
@@ -108,7 +105,7 @@ class Offscreen(SceneView):
 
     def _triangles(self, x: np.ndarray, attributes: np.ndarray, lines: tuple) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return projected points, triangles and attributes: clipped surfaces, then lines as bands."""
-        x, triangles, attributes = self.camera.clipped(x, self.surfaces.triangles, attributes, self.size)
+        x, triangles, attributes = self.camera.clipped(x, self.surfaces.triangles, attributes)
         points = self.camera.project(x, self._samples)
         ends, line_colours = self.camera.clipped_lines(*lines)
         if len(ends) == 0:

@@ -14,11 +14,11 @@ from taisoft.machine import usable_cores
 from taisoft.output.files import make_folder
 from taisoft.output.frames import FRAMES_NAME, FrameWriter
 from taisoft.view.annotations import Annotations
+from taisoft.view.choices import IN_PICTURES
 from taisoft.view.drawn import DrawnScene, DrawnState
 from taisoft.view.link import Viewer
 from taisoft.view.offscreen import SIZE, Offscreen
 from taisoft.view.plots import PlotChoice, Plots, plain_history
-from taisoft.view.scene_view import IN_PICTURES
 
 SLOTS = 8  # states that wait to be drawn, besides the pictures that wait to be written
 MIN_PICTURES = 30  # fewer take less time than it takes to start a process

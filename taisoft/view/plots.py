@@ -11,63 +11,17 @@ is lost, however long a simulation runs, and early and late steps have the same 
 Some plots show a quantity of each pair that presses, or of each body: the few largest.
 """
 
-from dataclasses import dataclass, replace
-from functools import partial
-
 import numpy as np
 
 from taisoft.errors import SceneError
-from taisoft.records import ERROR_KINDS, ErrorEstimate, StepReport
+from taisoft.records import ErrorEstimate, StepReport
 from taisoft.scene.checks import choice
-from taisoft.view.drawn import ENERGIES
+from taisoft.view.choices import CURVE_COLOURS, ENERGIES, ERROR_KINDS, PLOTS, Plot, Series
 
-BLUE, ORANGE, GREEN, DARK = (0.16, 0.42, 0.74), (0.87, 0.42, 0.13), (0.20, 0.56, 0.28), (0.30, 0.30, 0.36)  # sRGB
-COLOURS = (BLUE, ORANGE, GREEN, DARK)  # of a plot's curves; by pair or body it shows as many
 OF_PAIRS = {"forces": "contact_force", "torques": "contact_torque"}  # plot by pair -> query
 CAPACITY = 256  # bins, an even number
-SOLVERS = ("newton_residual", "contact_residual", "newton_iterations", "linear_iterations", "contact_iterations", "n_contacts")
-# energies as changes since the start, wall time in [ms], errors over the largest excursion in percent
-QUANTITIES = (*ENERGIES, "total", *SOLVERS, "step_time", *(f"{kind}_error" for kind in ERROR_KINDS))
-
-
-@dataclass(frozen=True)
-class Series:
-    """One curve of a plot. needs: "implicit" steps, "contact" forces, "error" estimates or ""; quantity: column of `History`."""
-
-    name: str
-    colour: tuple[float, float, float]
-    needs: str
-    quantity: str
-
-
-@dataclass(frozen=True)
-class Plot:
-    """Curves that share an axis. log: whether it is logarithmic; many: whether its series stands for one of each pair or body."""
-
-    title: str
-    unit: str
-    series: tuple[Series, ...]
-    log: bool = False
-    many: bool = False
-
-
-_newton, _linear = partial(Series, "Newton", BLUE, "implicit"), partial(Series, "CG", GREEN, "implicit")
-_contacts, _step = partial(Series, "contacts", ORANGE, "contact"), partial(Series, "step", BLUE, "")
-_iterations = _newton("newton_iterations"), _linear("linear_iterations"), _contacts("contact_iterations")
-_changes = tuple(Series(name, colour, "", name) for name, colour in zip(QUANTITIES, COLOURS))
-_errors = tuple(Series(kind, colour, "error", f"{kind}_error") for kind, colour in zip(ERROR_KINDS, (BLUE, ORANGE, GREEN)))
-PLOTS = {
-    "energies": Plot("energy change", "J", _changes),
-    "residuals": Plot("residuals", "", (_newton("newton_residual"), _contacts("contact_residual")), log=True),
-    "iterations": Plot("iterations of a step", "", _iterations),
-    "contacts": Plot("contacts", "", (_contacts("n_contacts"),)),
-    "step_time": Plot("wall time of a step", "ms", (_step("step_time"),), log=True),
-    "error": Plot("estimated error so far", "%", _errors, log=True),
-    "forces": Plot("force by pair", "N", (_contacts("forces"),), many=True),
-    "torques": Plot("torque by pair", "N m", (_contacts("torques"),), many=True),
-    "kinetic": Plot("kinetic energy by body", "J", (_step("kinetic"),), many=True),
-    "elastic": Plot("elastic energy by body", "J", (_step("elastic"),), many=True),
-}
+# columns of every history, energies first; wall time in [ms], errors over the largest excursion in percent
+QUANTITIES = tuple(dict.fromkeys(one.quantity for plot in PLOTS.values() if not plot.many for one in plot.series))
 
 
 class History:
@@ -85,26 +39,18 @@ class History:
         self.last = np.where(np.arange(len(QUANTITIES)) < 4, 0.0, np.nan)
         self.times, self.low, self.high = np.array([sim.time]), self.last[None], self.last[None]
 
-    def take(
-        self,
-        report: StepReport,
-        seconds: float,
-        explicit: bool,
-        touching: bool,
-        errors: ErrorEstimate | None = None,
-        **more: float,
-    ) -> None:
+    def take(self, report: StepReport, seconds: float, errors: ErrorEstimate | None = None, **more: float) -> None:
         """Record a step, or a batch of explicit steps.
 
-        seconds: its total wall time [s]; touching: whether contact forces are simulated; errors: so far, if estimated; more:
-        columns by pair or body, 0 for those that other steps had. Quantities not simulated are NaN.
+        seconds: its total wall time [s]; errors: so far, if estimated; more: columns by pair or body, 0 for those of other steps.
         """
-        energies = _energies(report) - self._start_energies
-        solved, touched = (np.nan if explicit else 1.0), (1.0 if touching else np.nan)
-        row = [*energies, energies.sum(), solved * report.residual, touched * report.contact_residual]
-        row += [solved * report.newton_iterations, solved * report.linear_iterations]
-        row += [touched * report.contact_iterations / report.steps, touched * report.n_contacts, 1e3 * seconds / report.steps]
-        row += [*(100.0 * np.array([getattr(errors, kind, None) for kind in ERROR_KINDS], dtype=float))]
+        changes = _energies(report) - self._start_energies
+        found = vars(report) | dict(zip(QUANTITIES, [*changes, changes.sum()]))
+        found |= {"newton_residual": report.residual, "contact_iterations": report.contact_iterations / report.steps}
+        found |= {"step_time": 1e3 * seconds / report.steps}
+        percent = 100.0 * np.array([getattr(errors, kind, None) for kind in ERROR_KINDS], dtype=float)
+        found |= dict(zip((f"{kind}_error" for kind in ERROR_KINDS), percent))
+        row = np.array([found[name] for name in QUANTITIES], dtype=float)
         if new := [name for name in more if name not in self.columns]:
             self.columns += new
             self.low, self.high = (np.pad(a, ((0, 0), (0, len(new))), constant_values=np.nan) for a in (self.low, self.high))
@@ -145,9 +91,9 @@ def series_of(plot: Plot, history) -> tuple[Series, ...]:
         return plot.series
     kind = f"{plot.series[0].quantity}: "
     own = [k for k, name in enumerate(history.columns) if name.startswith(kind)]
-    largest = np.argsort(-np.fmax.reduce(history.high[:, own], axis=0, initial=0.0), kind="stable")[: len(COLOURS)]
+    largest = np.argsort(-np.fmax.reduce(history.high[:, own], axis=0, initial=0.0), kind="stable")[: len(CURVE_COLOURS)]
     names = [history.columns[own[k]] for k in sorted(largest)]
-    return tuple(Series(name.removeprefix(kind), colour, "", name) for name, colour in zip(names, COLOURS))
+    return tuple(Series(name.removeprefix(kind), colour, "", name) for name, colour in zip(names, CURVE_COLOURS))
 
 
 class PlotChoice:
@@ -163,7 +109,7 @@ class PlotChoice:
         """Return the plots that have simulated quantities now, each with the curves of these."""
         enabled = {"": True} | self.enabled
         kept = {name: tuple(s for s in plot.series if enabled[s.needs]) for name, plot in PLOTS.items()}
-        return {name: replace(PLOTS[name], series=series) for name, series in kept.items() if series}
+        return {name: PLOTS[name]._replace(series=series) for name, series in kept.items() if series}
 
     def visible(self) -> list[Plot]:
         """Return the plots that are requested and available."""
@@ -192,8 +138,8 @@ class Plots(PlotChoice):
 
     def take(self, report: StepReport, seconds: float) -> None:
         """Record a step report; seconds: its wall time [s]. For `on_step` of a run."""
-        met, errors = self.enabled, self._sim.error_so_far if self._errors else None
-        self.history.take(report, seconds, not met["implicit"], met["contact"], errors, **self._by_name())
+        errors = self._sim.error_so_far if self._errors else None
+        self.history.take(report, seconds, errors, **self._by_name())
 
     def _by_name(self) -> dict[str, float]:
         """Return the columns of the requested plots by pair or body: forces [N], torques [N m] and energies [J]."""

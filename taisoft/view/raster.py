@@ -20,7 +20,7 @@ from taisoft.backend.runtime import kernel
 from taisoft.errors import OutputError
 from taisoft.view.shading import MAP, ORDINALS, SAMPLES, TILE, WIDTH, colour_at, resolve
 
-MAX_COORDINATE = 1e6  # samples; triangles beyond are skipped, and `Viewpoint.clipped` leaves none
+MAX_COORDINATE = 1e10  # samples; triangles beyond are skipped
 MIN_AREA = 1e-10  # samples^2; twice that of a triangle that is drawn
 FLAT = 1e-12  # samples; an edge that rises less bounds no row
 UNBOUNDED = 1e30  # samples, where an edge does not bound a row

@@ -2,43 +2,27 @@
 
 Normals are those of `taisoft/output/smoothing.py`. A second-order face is drawn as four flat triangles between its six nodes.
 Obstacles are drawn with back-face culling, so that a bin's walls show only their inner sides.
-
-Lines are wireframes of the bodies' surfaces, contacts with normals and impulses, arrows of tractions and pressures, and
-connections. They are moved along their rays towards the eye, so that they cover the same pixels: wireframes just enough to lie in
-front of their own surface, all others so far that nothing hides them.
 """
 
 from dataclasses import replace
 
 import numpy as np
 
-from taisoft.errors import OutputError
-from taisoft.mesh.topology import triangle_edges
-from taisoft.output.appearance import ObstacleSurface, ShownBodies, body_colours, obstacle_colour, obstacle_surfaces, subdivide
-from taisoft.output.smoothing import smoothing_groups, unit, vertex_normals
+from taisoft.output.appearance import ObstacleSurface, ShownBodies, body_colours, capsule, obstacle_colour, obstacle_surfaces
+from taisoft.output.smoothing import smoothing_groups, vertex_normals
 from taisoft.output.viewpoint import MAX_WIDENING, WHOLE, Viewpoint, camera_viewpoint
 from taisoft.scene import checks
 from taisoft.scene.look import Camera, check_follow
 from taisoft.scene.obstacles import HalfSpace
 from taisoft.view.colouring import Colouring, lit_colours
-from taisoft.view.connection_layer import ConnectionLayer, PressureLayer, arrows
 from taisoft.view.drawn import DrawnBody, DrawnScene, DrawnState
 from taisoft.view.ground import Square, finite_points
-from taisoft.view.sampling import MAX_CONTACTS, Sampler
+from taisoft.view.layers import Layers
+from taisoft.view.sampling import Sampler
 
 MARKER_COLOUR = np.array([0.20, 0.22, 0.26])  # sRGB
+MARKER_FACETS = (12, 3)  # around its axis, and from the equator to a pole
 MARKER_SIZE = 0.16  # radius in units of the mean edge length of the body's surface
-
-LAYERS = ("wires", "contacts", "tractions", "pressures", "connections", "fibres", "fixed_nodes")
-IN_PICTURES = ("pressures", "connections", "fibres", "fixed_nodes")  # shown by default
-IN_WINDOW = ("tractions", *IN_PICTURES)
-MAX_MARK_LINES = 4 * MAX_CONTACTS  # largest number of lines of contacts and arrows, besides the wires
-ON_SURFACE, IN_FRONT = 0.996, 0.1  # fractions of the distance from the eye
-NORMAL, IMPULSE, ARROW = 0.04, 0.15, 0.10  # lengths relative to the scene's size
-DECAY = 0.99  # factor on the running maximum of impulses per picture
-WIRE_COLOUR, NORMAL_COLOUR = np.array([0.12, 0.14, 0.18]), np.array([0.10, 0.55, 0.25])  # sRGB
-IMPULSE_COLOUR, TRACTION_COLOUR = np.array([0.85, 0.12, 0.12]), np.array([0.55, 0.15, 0.65])
-FIBRE_COLOUR = np.array([0.38, 0.06, 0.10])
 
 
 class SceneView:
@@ -46,7 +30,7 @@ class SceneView:
 
     scene: a Scene, which is read once, or what is drawn of one; size: (width, height) in pixels; camera: fixed if given, else the
     scene's own, else it frames all bodies at the start, and where they fall on a ground, and moves back, never nearer, when a
-    body would leave the picture; colour: of the bodies, one of UNITS; layers: names of visible LAYERS. Raises OutputError for
+    body would leave the picture; colour: of the bodies, one of COLOURS; layers: names of visible LAYERS. Raises OutputError for
     unknown names.
     """
 
@@ -159,59 +143,6 @@ class Surfaces:
         return np.concatenate([x for x, _ in parts]), np.concatenate([n for _, n in parts])
 
 
-class Layers:
-    """Optional layers beside the surfaces.
-
-    shown: name -> whether it is visible, initially those in `names`; n_segments: largest number of lines that `lines` returns;
-    peak: recent maximum of impulses [N s], which scales their lines. Raises OutputError for an unknown name.
-    """
-
-    def __init__(self, scene, names: tuple[str, ...] = IN_WINDOW):
-        for name in names:
-            checks.choice(name, "layer", LAYERS, OutputError)
-        self.shown = {name: name in names for name in LAYERS}
-        scene = DrawnScene.of(scene)
-        self._shown = ShownBodies(scene)
-        surfaces = zip(self._shown.surfaces, self._shown.starts)
-        self._edges = np.concatenate([triangle_edges(triangles)[0] + n for (_, triangles), n in surfaces])
-        self._size, self.peak = scene.size, 0.0
-        firsts = {body.name: scene.rows[body.name].start for body in scene.bodies}
-        self._strokes = [(firsts[b.name] + b.strokes[0], b.strokes[1]) for b in scene.bodies if b.strokes is not None]
-        self._loaded = [firsts[body.name] + corners for body in scene.bodies for corners in body.loaded]
-        self.n_segments = len(self._edges) + MAX_MARK_LINES + sum(len(nodes) for nodes, _ in self._strokes)
-        self.connections, self.pressures = ConnectionLayer(), PressureLayer()
-
-    def lines(self, state: DrawnState, camera: Viewpoint) -> tuple[np.ndarray, np.ndarray]:
-        """Return the ends (2k,3) [m] of the lines, as drawn for this camera, and their colours (2k,3)."""
-        x = state.x
-        marks = self._contact_lines(**state.contacts) if self.shown["contacts"] and state.contacts else []
-        if self.shown["tractions"]:
-            longest = max((float(np.linalg.norm(t)) for t in state.tractions), default=0.0) or 1.0
-            for corners, traction in zip(self._loaded, state.tractions):
-                arrow = ARROW * self._size / longest * traction
-                marks.append((arrows(x[corners].mean(axis=1), arrow, camera), TRACTION_COLOUR))
-        for name, layer in (("pressures", self.pressures), ("connections", self.connections)):
-            marks += layer.lines(state, camera) if self.shown[name] else []
-        marks = [(camera.nearer(ends, IN_FRONT), colour) for ends, colour in marks]
-        for nodes, weights in self._strokes if self.shown["fibres"] else ():
-            ends = weights @ x[nodes]
-            marks.append((camera.nearer(ends.reshape(-1, 3), ON_SURFACE), FIBRE_COLOUR))
-        if self.shown["wires"]:  # last, since lines beyond the renderer's limit are dropped from the end
-            marks.append((camera.nearer(self._shown.of(x)[self._edges].reshape(-1, 3), ON_SURFACE), WIRE_COLOUR))
-        ends = [np.empty((0, 3)), *(part for part, _ in marks)]
-        colours = [np.empty((0, 3)), *(np.broadcast_to(colour, part.shape) for part, colour in marks)]
-        return np.concatenate(ends), np.concatenate(colours)
-
-    def _contact_lines(self, point: np.ndarray, normal: np.ndarray, impulse: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Return lines of normals with a fixed length, and of impulses relative to the recent maximum."""
-        self.peak = max(DECAY * self.peak, float(np.linalg.norm(impulse, axis=1).max(initial=0.0)))
-        relative = impulse / self.peak if self.peak > 0.0 else 0.0 * impulse
-        return [
-            (_segments(point, point + NORMAL * self._size * normal), NORMAL_COLOUR),
-            (_segments(point, point + IMPULSE * self._size * relative), IMPULSE_COLOUR),
-        ]
-
-
 class _BodySurface:
     """Topology of a body's drawn surface, with balls as markers of fixed nodes.
 
@@ -223,7 +154,7 @@ class _BodySurface:
         nodes, corners = smoothing_groups(rest, surface)
         edges = rest[surface] - rest[np.roll(surface, 1, axis=1)]
         marked = body.fixed
-        ball, ball_triangles = _coarse_ball()
+        ball, ball_triangles = capsule(0.0, 1.0, *MARKER_FACETS)
         counts = len(nodes), len(ball) * len(marked)
         starts = len(nodes) + len(ball) * np.arange(len(marked))
         markers = (starts[:, None, None] + ball_triangles).reshape(-1, 3)
@@ -267,20 +198,3 @@ class _RigidSurface:
         back_facing = np.einsum("ti,ti->t", np.cross(b - a, c - a), eye - a) <= 0
         corners[back_facing] = a[back_facing, None]  # triangles of zero area are invisible
         return corners.reshape(-1, 3), normals.reshape(-1, 3)
-
-
-def _coarse_ball() -> tuple[np.ndarray, np.ndarray]:
-    """Return a coarse unit sphere: an octahedron subdivided twice, 66 vertices (n,3) and 128 triangles (t,3)."""
-    points = np.concatenate([np.eye(3), -np.eye(3)])
-    faces = [(x, y, z) for x in (0, 3) for y in (1, 4) for z in (2, 5)]
-    # with an odd number of negative axes, the order x, y, z would point inward
-    triangles = np.array([f if sum(k > 2 for k in f) % 2 == 0 else f[::-1] for f in faces])
-    for _ in range(2):
-        points, triangles = subdivide(points, triangles)
-        points = unit(points)
-    return points, triangles
-
-
-def _segments(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Return the ends (2k,3) of lines from a (k,3) to b (k,3)."""
-    return np.stack([a, b], axis=1).reshape(-1, 3)

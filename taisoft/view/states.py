@@ -21,11 +21,11 @@ from taisoft.output.files import Observer, make_folder
 from taisoft.scene import checks
 from taisoft.scene.look import Camera, check_follow, colour_of, opacity_of
 from taisoft.scene.scene import Scene
+from taisoft.view.choices import LAYERS
 from taisoft.view.colouring import checked_colour
 from taisoft.view.drawn import DrawnBody, DrawnScene, DrawnState
 from taisoft.view.offscreen import SIZE, Offscreen
 from taisoft.view.sampling import Sampler
-from taisoft.view.scene_view import LAYERS
 
 STATES_NAME, SCENE_NAME = "states", "scene.npz"
 FORMAT = 1  # increment it with every change of a file's content
@@ -121,7 +121,7 @@ class StoredRun(Guarded):
         return f"StoredRun({str(self.folder)!r}, {len(self)} frames)"
 
     def state(self, frame: int, kind: str = "body") -> DrawnState:
-        """Return the state of a frame, by its number, with a quantity at the nodes, one of UNITS. Raises OutputError."""
+        """Return the state of a frame, by its number, with a quantity at the nodes, one of COLOURS. Raises OutputError."""
         path = self.folder / STATES_NAME / f"{frame!r:0>5}.npz"
         if not path.exists():
             raise OutputError(f"{self.folder}: there is no frame {frame!r}: they are {self.frames[0]} to {self.frames[-1]}")

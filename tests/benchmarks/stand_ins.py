@@ -62,7 +62,7 @@ class ModelSimulator:
         estimate = SimpleNamespace(**estimate, order=1.0, wall_seconds=3.0, notes=["a note"])
         known = estimate if error or self._estimated else None
         found = {"status": "ok", "steps": round(seconds / self.dt), "step_reports": [], "problems": [], "interrupted": False}
-        return SimpleNamespace(**found, wall_seconds=1.0, pilot_seconds=0.5, error_estimate=known)
+        return SimpleNamespace(**found, wall_seconds=1.0, trial_seconds=0.5, error_estimate=known)
 
 
 def answer_here(patch: pytest.MonkeyPatch, answer: Callable[[dict], dict]) -> None:

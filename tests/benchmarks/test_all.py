@@ -115,7 +115,9 @@ def error_small(patch, folder):
 def error_check(n):
     (beam,) = n["rows"]
     dt, n_tets = 1 / 60, beam["tets"]
-    assert beam["steps"] == round(2.0 / dt) and beam["twins"] == 3.0 and beam["estimated"]["time"] == pytest.approx(TIME * dt)
+    assert (
+        beam["steps"] == round(2.0 / dt) and beam["companions"] == 3.0 and beam["estimated"]["time"] == pytest.approx(TIME * dt)
+    )
     true = {"time": TIME * dt * 15 / 16 + SOLVER, "space": SPACE / n_tets * 63 / 64, "solver": SOLVER}
     for what, value in true.items():
         assert beam["true"][what] == pytest.approx(value / (1.0 + SPACE / n_tets + TIME * dt / 16), rel=1e-6)

@@ -61,7 +61,15 @@ def test_limits_of_forces():
 
 def test_limits_of_error():
     def row(kind=SMOOTH, time: float | None = 1e-3, **more) -> error.Row:
-        numbers = {"name": "made up", "integrator": "bdf2", "tets": 5, "steps": 9, "status": "ok", "order": 1.5, "twins": 2.0}
+        numbers = {
+            "name": "made up",
+            "integrator": "bdf2",
+            "tets": 5,
+            "steps": 9,
+            "status": "ok",
+            "order": 1.5,
+            "companions": 2.0,
+        }
         numbers |= {"kind": kind, "estimated": {"time": time, "space": 0.1, "solver": 0.0}}
         return error.Row(true={"time": 1e-3, "space": 0.1, "solver": 0.0}, **numbers | more)
 

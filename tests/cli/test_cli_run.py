@@ -90,7 +90,7 @@ def test_notes_and_warnings_are_printed_and_reported(tmp_path, capsys):
     assert "problem" not in shown and shown.index("\nwarning") < shown.index("\nnote")
 
 
-def test_a_run_with_twins_says_what_they_cost(beam, tmp_path, capsys):
+def test_a_run_with_companions_says_what_they_cost(beam, tmp_path, capsys):
     """It also prints and writes quantities with their errors."""
     out, heading = tmp_path / "out", "quantity the tip [m]"
     tip = ("--quantity", "the tip=displacement.y beam 2 0 0", "--details", "quantities")
@@ -100,8 +100,8 @@ def test_a_run_with_twins_says_what_they_cost(beam, tmp_path, capsys):
     assert -0.02 < found["value"] < -0.01 and 0.0 < found["space"] < 0.01 and found["solver"] == 0.0
     *_, last = csv.DictReader((out / "steps.csv").read_text().splitlines())
     assert float(last[heading]) == found["value"]
-    assert "\ntwins    follow the run, the one on the refined mesh for some 10 to 40 times its work" in shown
-    assert re.search(r"; plus \d+\.\d\d s of twins for the error and ", shown)
+    assert "\nerror    companions follow the run, the one on the refined mesh for some 10 to 40 times its work" in shown
+    assert re.search(r"; plus \d+\.\d\d s of companions for the error and ", shown)
 
 
 def test_a_picture_that_cannot_be_written_ends_the_run(beam, tmp_path, monkeypatch, capsys):

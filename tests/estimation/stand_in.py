@@ -1,4 +1,4 @@
-"""A simulator of nodes on springs of their own: tests of error estimates and pilots run hundreds of its steps in milliseconds.
+"""A simulator of nodes on springs of their own: tests of error estimates and trials run hundreds of its steps in milliseconds.
 
 Each node vibrates about its place at rest, x'' = -w^2 (x - X) - d x' + g (1 + c h^2), in steps of the package's integrators. h is
 a mesh width, and c makes an error of the mesh. A stiff floor pushes nodes up. The stand-in has what `taisoft.running`,

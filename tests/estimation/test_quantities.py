@@ -1,5 +1,5 @@
 """Quantities of a run and their errors: exact for power laws, within a factor of 3 of oscillations and of a bar's tip; what texts
-mean, and what is refused; a quantity without a value, or with none in a twin, is unknown with a reason and loses nothing else.
+mean, and what is refused; a quantity without a value, or with none in a companion, is unknown with a reason.
 """
 
 import json
@@ -106,7 +106,7 @@ def at_rest(cells, **arguments):
 
 @pytest.fixture(scope="module")
 def bars():
-    """The run on a mesh, with its twin on another one."""
+    """The run on a mesh, with its companion on another one."""
     return at_rest((6, 2, 2), error=True, error_mesh=bar((12, 4, 4))), at_rest((12, 4, 4), error=True, error_mesh=bar((6, 2, 2)))
 
 
@@ -162,14 +162,14 @@ def test_a_quantity_without_a_value_degrades_the_run(function, reason):
     assert good.value == 1.0 and good.time == 0.0 and not good.notes and "bad = unknown" in repr(report)
 
 
-def test_a_quantity_without_a_value_in_a_twin():
+def test_a_quantity_without_a_value_in_a_companion():
     twice = raises_where(lambda sim: sim.dt > 1 / 50)
     report = run(StandIn(block()), 1.0, fps=16, error=True, quantities={"q": twice})
     q = report.quantities["q"]
-    note = "the error of 'q' in time is unknown: in the twin with dt = 0.03125 s, ZeroDivisionError: division by zero"
+    note = "the error of 'q' in time is unknown: in the companion with dt = 0.03125 s, ZeroDivisionError: division by zero"
     assert q.value == 1.0 and q.time is None and q.solver == 0.0 and q.notes == [note] and report.status == "ok"
     late = run(StandIn(block()), 66 / 64, fps=64 / 6, error=True, quantities={"q": lambda sim: sim.time}).quantities["q"]
-    assert late.notes == ["the errors of 'q' are those at t = 1 s, where the twins meet the run"]
+    assert late.notes == ["the errors of 'q' are those at t = 1 s, where companions meet the run"]
 
     def change(sim, k, _report):
         sim.changes += k == 5

@@ -1,6 +1,6 @@
-"""Runs to a tolerance, mostly of stand-ins: which pilots choose the steps; the estimate meets the tolerance, or the report says
-why not; pilots leave the state as it was; real runs meet the tolerance, repeat bitwise and resume from checkpoints without
-pilots.
+"""Runs to a tolerance, mostly of stand-ins: which trials choose the steps; the estimate meets the tolerance, or the report says
+why not; trials leave the state as it was; real runs meet the tolerance, repeat bitwise and resume from checkpoints without
+trials.
 """
 
 import json
@@ -11,7 +11,7 @@ import pytest
 import taisoft as ts
 from taisoft.cli import EXIT_BAD_INPUT
 from taisoft.errors import SimulationError
-from taisoft.estimation.pilots import Frames
+from taisoft.estimation.trials import Frames
 from taisoft.running import run
 from tests.cli.command import BEAM, SHORT_OUTPUT, write
 from tests.cli.command import run as call
@@ -50,9 +50,9 @@ def test_runs_and_frames_of_any_length(make, seconds, fps):
 
 
 @pytest.mark.parametrize(
-    "make, kind, tolerance, pilots, per_frame",
+    "make, kind, tolerance, trials, per_frame",
     [
-        (soft, ELASTIC, 0.1, "1 part2", 1),  # one pilot, whose hardest part is run again with a slightly smaller step
+        (soft, ELASTIC, 0.1, "1 part2", 1),  # one trial, whose hardest part is run again with a slightly smaller step
         (soft, ELASTIC, 0.001, "1 4", 6),
         (soft, CREEPING, 0.02, "1 part2 part2", 1),  # its fastest part too
         (soft, IMPACT, 0.01, "1 4", 4),
@@ -62,17 +62,17 @@ def test_runs_and_frames_of_any_length(make, seconds, fps):
         (stiff, motion(frequency=3.0, newton=50), 0.01, "1/4 implicit 128 part160", 128),
     ],
 )
-def test_which_pilots_choose_the_steps(make, kind, tolerance, pilots, per_frame, monkeypatch):
+def test_which_trials_choose_the_steps(make, kind, tolerance, trials, per_frame, monkeypatch):
     """Given by their steps in a frame."""
-    found, pilot = [], Frames.pilot
+    found, trial = [], Frames.trial
 
     def spied(frames, sim, steps, stop, part=None, **options):
         found.append(f"{'' if part is None else 'part'}{steps}" + (" implicit" if sim.settings.integrator == BDF2 else ""))
-        return pilot(frames, sim, steps, stop, part, **options)
+        return trial(frames, sim, steps, stop, part, **options)
 
-    monkeypatch.setattr(Frames, "pilot", spied)
+    monkeypatch.setattr(Frames, "trial", spied)
     result = run(make(tolerance, kind, integrator="implicit_midpoint"), 0.6)
-    assert (" ".join(found), result.steps, result.status) == (pilots, 36 * per_frame, "ok")
+    assert (" ".join(found), result.steps, result.status) == (trials, 36 * per_frame, "ok")
     assert result.error_estimate.time <= tolerance
     assert result.problems[0].startswith(f"note: for a tolerance of {100 * tolerance:.3g} %: ")
 
@@ -87,7 +87,7 @@ def test_which_pilots_choose_the_steps(make, kind, tolerance, pilots, per_frame,
     ],
 )
 def test_implicit_steps_pass_over_vibrations_of_contacts(friction, tolerance, error, integrator):
-    """Where there is friction, whether pilots or twins estimate the error; finer pilots would not help."""
+    """Where there is friction, whether trials or companions estimate the error; finer trials would not help."""
     scene = block(young=3e7, friction=friction)
     scene.add_obstacle(ts.HalfSpace((0.0, -9.0, 0.0), (0.0, 1.0, 0.0)), name="ground", friction=friction)
     sim = motion(frequency=3.0, floor=-0.4499)(scene, 1 / 60, BDF2, tolerance=tolerance)
@@ -100,7 +100,7 @@ def test_implicit_steps_pass_over_vibrations_of_contacts(friction, tolerance, er
 
 
 def test_errors_above_the_tolerance_or_unknown_degrade_a_run():
-    """Paths diverge whose nodes are kicked once, each time in another way. The solvers' error counts where twins estimate it."""
+    """Paths diverge whose nodes are kicked once, each time in another way. The solvers' error counts where it is estimated."""
 
     def kick(sim):
         if sim.time < 0.09 <= sim.time + sim.dt:
@@ -117,7 +117,7 @@ def test_errors_above_the_tolerance_or_unknown_degrade_a_run():
     assert max(e.time, e.solver) < 0.01 < e.total and result.status == "degraded"
 
 
-def test_bad_runs_are_refused_before_pilots():
+def test_bad_runs_are_refused_before_trials():
     counts: list = []
     sim = soft(kind=motion(before_step=counts.append))
     sim.dragged = True
@@ -126,12 +126,12 @@ def test_bad_runs_are_refused_before_pilots():
     assert not counts
 
 
-def test_a_stop_or_ctrl_c_during_the_pilots_leaves_the_start():
+def test_a_stop_or_ctrl_c_during_the_trials_leaves_the_start():
     calls = iter(range(99))
     sim = stiff(integrator="implicit_midpoint", dt=0.01)
     result = run(sim, 0.5, stop=lambda: next(calls) >= 5)
     assert result.interrupted and result.status == "degraded" and result.steps == 0
-    assert "interrupted during its pilots" in result.problems[0]
+    assert "interrupted during its trials" in result.problems[0]
     with pytest.raises(KeyboardInterrupt):
         run(sim, 0.5, stop=lambda: (_ for _ in ()).throw(KeyboardInterrupt))
     assert (sim.settings.integrator, sim.dt, sim.time, sim.step_count) == ("implicit_midpoint", 0.01, 0.0, 0)
@@ -162,7 +162,7 @@ def two(young=1e6) -> ts.Scene:
 
 
 @pytest.mark.parametrize("young, integrator", [(1e6, VERLET), (1e12, BDF2)])
-def test_a_real_run_meets_the_tolerance_and_resumes_without_pilots(young, integrator, tmp_path):
+def test_a_real_run_meets_the_tolerance_and_resumes_without_trials(young, integrator, tmp_path):
     """Its true error is that against a sixteenth of its steps; it is bitwise the same whether it is observed or not."""
     path, ends, fine, checkpoint = [], [], [], tmp_path / "c.npz"
 
@@ -176,7 +176,7 @@ def test_a_real_run_meets_the_tolerance_and_resumes_without_pilots(young, integr
             sim.reset()
             result = sim.run(0.2, on_frame=on_frame)
             ends.append(sim.positions())
-        assert sim.settings.integrator == integrator and result.pilot_seconds > 0.0
+        assert sim.settings.integrator == integrator and result.trial_seconds > 0.0
         sim.rebuild(tolerance=1e-3)
         assert sim.settings.newton_tolerance == 5e-5
         with pytest.raises(SimulationError, match=r"run\(\) chooses the integrator"):
@@ -185,7 +185,7 @@ def test_a_real_run_meets_the_tolerance_and_resumes_without_pilots(young, integr
     with ts.Simulator.load_checkpoint(checkpoint, two(young)) as sim:
         assert sim.settings.tolerance == 0.01 and sim.step_count > 0
         resumed = sim.run(0.2, resumed=True)
-        assert resumed.pilot_seconds == 0.0 and resumed.error_estimate is None and "is not estimated" in resumed.problems[-1]
+        assert resumed.trial_seconds == 0.0 and resumed.error_estimate is None and "is not estimated" in resumed.problems[-1]
         assert np.array_equal(sim.positions(), ends[0])
         sim.rebuild(tolerance=None)
         assert sim.settings.newton_tolerance is None
@@ -200,7 +200,7 @@ def test_the_command_chooses_steps_and_estimates_errors(tmp_path, capsys):
     scene, out = write(tmp_path / "beam.py", BEAM.replace('"fps": 30', '"fps": 30, "precision": "f64"')), tmp_path / "out"
     assert call(scene, "--tolerance", 0.01, "--out", out, *SHORT_OUTPUT) == 0
     printed, report = capsys.readouterr().out, json.loads((out / "report.json").read_text())
-    assert "for a tolerance of 1 %" in printed and "error    about " in printed and report["pilot_seconds"] > 0.0
+    assert "for a tolerance of 1 %" in printed and "error    about " in printed and report["trial_seconds"] > 0.0
     assert report["settings"]["tolerance"] == 0.01 and report["error_estimate"]["time"] <= 0.01
     resumed = ("--resume", out / "checkpoint.npz", "--out", out, "--seconds", 0.2, *SHORT_OUTPUT)
     assert call(scene, *resumed) == 0 and "keeps the steps" in capsys.readouterr().out

@@ -337,7 +337,7 @@ def test_refused_numbers_and_activations():
         plain.material = MUSCLE
     with pytest.raises(SceneError, match=r"body 'muscle': activate: the path must give|must be a number"):
         block().bodies[0].activate(lambda t: None)
-    with pytest.raises(MeshError, match=r"fibres must be numbers of shape \(10, 3\)"):
+    with pytest.raises(MeshError, match=r"fibres must have shape \(10, 3\)"):
         ts.TetMesh(MESH.vertices, MESH.tets, fibres=np.ones(3))
 
 

@@ -11,7 +11,7 @@ from taisoft.errors import SceneError
 from taisoft.scene.fingerprint import scene_digest
 from taisoft.scene.refine import refined, with_order
 from taisoft.stability import hooke_stiffness, stable_dt
-from taisoft.view.controls import Controls
+from taisoft.view.window.controls import Controls
 from tests.dynamics.scenes import SNH, SVK, cube, halved, rubber
 from tests.fem.oracle_laws import pk1
 from tests.scene.toml_scenes import there_and_back

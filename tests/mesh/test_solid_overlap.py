@@ -8,22 +8,16 @@ from scipy.optimize import linprog
 from scipy.spatial.transform import Rotation
 
 import taisoft as ts
-from taisoft.mesh.sdf import greatest_depth, signed_distances_at
-from taisoft.mesh.solids import (
-    ALLOWED,
-    Solid,
+from taisoft.mesh.distances import (
     are_inside,
-    connected_parts,
-    cut_depths,
     distances,
-    inner_depths,
-    inner_tets,
+    greatest_depth,
     is_closed,
     nearest_hit,
-    overlap_depth,
     segment_distance,
-    solid_depths,
+    signed_distances,
 )
+from taisoft.mesh.solids import ALLOWED, Solid, connected_parts, cut_depths, inner_depths, inner_tets, overlap_depth, solid_depths
 
 
 def box(n: int, size=(1, 1, 1), pattern="five") -> ts.TetMesh:
@@ -142,7 +136,7 @@ def test_cut_depths_agree_with_linear_programming():
 def test_distances_of_points_rays_and_segments():
     rng, mesh = np.random.default_rng(1), MESHES["hollow"]
     corners, points = mesh.vertices[mesh.surface], rng.uniform(-2, 2, (300, 3))
-    exact = signed_distances_at(mesh.vertices, mesh.surface, points)
+    exact = signed_distances(mesh.vertices, mesh.surface, points)
     assert np.abs(distances(corners, points) - np.abs(exact)).max() < 1e-12
     assert np.array_equal(are_inside(corners, points), exact < 0.0) and 50 < (exact < 0.0).sum() < 250
     assert np.abs(solid_depths(corners, points) - np.maximum(-exact, 0.0)).max() < 1e-12

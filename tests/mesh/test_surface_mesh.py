@@ -67,7 +67,7 @@ V = "v 0 0 0\nv 1 0 0\nv 0 1 0\n"
         ("a.off", "OFF 3 0 0\n" + POINTS, "no triangles found"),
         ("a.obj", "v 0 0\n", "line 1: expected v and three coordinates, not 'v 0 0'"),
         ("a.obj", V.replace("1 0\n", "nan 0\n") + "f 1 2 3\n", "vertex 2 coordinate 1 is not finite"),
-        ("a.obj", V + "f 1 2 4\n", r"triangle 0: vertex 3 does not exist \(3 vertices\)"),
+        ("a.obj", V + "f 1 2 4\n", r"triangle 0: vertex 3 does not exist \(3 vertices, counted from 0\)"),
         ("a.obj", V + "f 1 0 1\n", "line 4: expected f and at least 3 corners"),
         ("a.obj", V + "vt x\n", "line 4: expected vt and one or two numbers, not 'vt x'"),
         ("a.obj", V + "vt 0 0\nf 1/1 2 3/1\n", "line 5: expected f and at least 3 corners, all or none of them with a vt"),
@@ -120,7 +120,7 @@ def test_invalid_arrays_are_rejected():
     for vertices, triangles, message in (
         (np.where(np.arange(3) == 1, np.nan, X), T, "vertex 0 coordinate 1 is not finite"),
         (X, T.astype(float), "triangles must be integers, not float64"),
-        (X, [*T, (0, 1, len(X))], f"triangle {len(T)}: vertex {len(X)} does not exist \\({len(X)} vertices\\)$"),
+        (X, [*T, (0, 1, len(X))], f"triangle {len(T)}: vertex {len(X)} does not exist \\({len(X)} vertices, counted from 0\\)$"),
     ):
         with pytest.raises(MeshError, match=f"^here: {message}"):
             ts.SurfaceMesh(vertices, triangles, "here")

@@ -13,9 +13,9 @@ from taisoft.output.connection_lines import ConnectionLines
 from taisoft.output.frame_table import FrameTable
 from taisoft.output.usd import UsdWriter
 from taisoft.output.viewpoint import Viewpoint
-from taisoft.view.colouring import COLOURS
-from taisoft.view.connection_layer import ATTACHED_COLOUR, PRESSURE_COLOUR, PressureLayer
+from taisoft.view.colouring import GRADIENT
 from taisoft.view.drawn import DrawnScene, DrawnState
+from taisoft.view.layers import ATTACHED_COLOUR, IN_FRONT, PRESSURE_COLOUR, Layers
 from taisoft.view.offscreen import Offscreen
 from tests.collision.rotations import rotation
 from tests.dynamics.scenes import cube, rubber
@@ -81,7 +81,7 @@ def test_pictures_show_connections_and_pressures(moved):
     _, sim = moved
     choices = {}, {"layers": ("fixed_nodes",)}, {"layers": ("connections",)}, {"layers": ("pressures",)}
     default, plain, connections, pressures = (Offscreen(sim.scene, (640, 360), **layers).image(sim) for layers in choices)
-    for colour in (COLOURS[-1], COLOURS[0], ATTACHED_COLOUR, PRESSURE_COLOUR):
+    for colour in (GRADIENT[-1], GRADIENT[0], ATTACHED_COLOUR, PRESSURE_COLOUR):
         shown = pressures if colour is PRESSURE_COLOUR else connections
         assert min(count(default, colour), count(shown, colour)) > count(plain, colour) + 8
     drawing = Offscreen(sim.scene, (64, 36))
@@ -89,7 +89,7 @@ def test_pictures_show_connections_and_pressures(moved):
     kept = drawing.kept(sim.time + 1.0)
     assert kept["tension"] == pytest.approx(9e3) and kept["pressure"] == 2e3
     drawing.resume(kept | {"tension": 5.0, "pressure": 6.0})
-    assert (drawing.layers.connections.peak, drawing.layers.pressures.peak) == (5.0, 6.0)
+    assert drawing.layers.peaks == {"impulse": 0.0, "tension": 5.0, "pressure": 6.0}
 
 
 def hollow_scene() -> ts.Scene:
@@ -111,8 +111,9 @@ def test_arrows_point_along_the_force(pressure):
     drawn = DrawnScene.of(scene)
     drawn.pressed = [(corners, 3.0 / drawn.size * longest) for corners, longest in drawn.pressed]  # as for a scene of 3 m
     state = replace(DrawnState.at_start(drawn), pressures=[1.0, pressure])
-    found = PressureLayer().lines(state, camera)
-    shafts = [ends[: len(ends) // 3].reshape(-1, 2, 3) for ends, _ in found]  # of the side, then of the cavity
+    ends = camera.nearer(Layers(drawn, ("pressures",)).lines(state, camera)[0], 1.0 / IN_FRONT)
+    n_side = 6 * len(drawn.pressed[0][0])
+    shafts = [own[: len(own) // 3].reshape(-1, 2, 3) for own in (ends[:n_side], ends[n_side:])]  # of the side, then of the cavity
     assert shafts[0][:, 1, 0] == pytest.approx(1.5) and np.allclose(shafts[0][:, 0] - shafts[0][:, 1], (0.105, 0, 0))
     start, tip = np.abs(shafts[1]).max(axis=2).T  # in the norm whose unit ball is a cube
     assert len(tip) >= 10 and (tip if pressure > 0 else start) == pytest.approx(0.5)

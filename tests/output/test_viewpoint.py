@@ -167,7 +167,7 @@ def test_floor_that_reaches_behind_the_camera_is_clipped():
     corners = np.array([*floor, [0, 1, -9], [1, 1, -9], [0, 2, -9], [0, 1, 9], [1, 1, 9], [0, 2, 9]])
     shades, triangles = (corners + half) / (2 * half), np.array([[0, 2, 1], [0, 3, 2], [4, 5, 6], [7, 8, 9]])
     camera = Viewpoint(target=np.array([0.0, 0.5, 0.0]), distance=3.0, azimuth=20.0, elevation=10.0)
-    x, cut, colours = camera.clipped(corners, triangles, shades, SIZE)
+    x, cut, colours = camera.clipped(corners, triangles, shades)
     assert not (cut == 7).any() and np.array_equal(x[: len(corners)], corners) and (cut == [4, 5, 6]).all(axis=1).sum() == 1
     image, below = np.zeros((height, width, 3), dtype=np.uint8), (cut != [4, 5, 6]).all(axis=1)
     drawn = rasterise(camera.project(x, SIZE), cut[below], colours, camera.clipping[0], image)
@@ -181,10 +181,8 @@ def test_floor_that_reaches_behind_the_camera_is_clipped():
     assert (drawn != expected).mean() < 0.005 and 0.4 < expected.mean() < 0.8
     both = drawn & expected
     assert np.abs(image[both] / 255 - (hit[both] + half) / (2 * half))[:, [0, 2]].max() < 0.02
-    large = np.abs(camera.project(camera.clipped(corners, triangles, shades, (2560, 1440))[0], (2560, 1440))[len(corners) :, :2])
-    assert 1e4 < large.max() < 5e5, "drawable in a large picture too"
     corners[4] = np.nan
-    assert not (camera.clipped(corners, triangles, shades, SIZE)[1] == 4).any()
+    assert not (camera.clipped(corners, triangles, shades)[1] == 4).any()
 
 
 def test_lines_are_clipped_at_the_near_plane():

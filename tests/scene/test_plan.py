@@ -41,8 +41,8 @@ def test_every_feature_can_be_on_and_off():
     off = make_plan(block_scene(), explicit=True, multistep=False).on
     full = driven_scene(order=2, mass_damping=1.0, stiffness_damping=1.0, connected=True)
     full.add_spring(("beam", 0), ("flyer", 0), 1.0, damping=1.0)
-    full.add_body(full.body("beam").mesh, full.body("beam").material, name="twin", position=full.body("beam").position)
-    full.attach("twin", [0], "beam")
+    full.add_body(full.body("beam").mesh, full.body("beam").material, name="companion", position=full.body("beam").position)
+    full.attach("companion", [0], "beam")
     full.add_obstacle(ts.HalfSpace((0, -9, 0), (0, 1, 0)))
     full.body("beam").young = np.full(full.body("beam").mesh.n_tets, 1e5)
     full.body("beam").add_force([4], lambda t: (t, 0, 0))

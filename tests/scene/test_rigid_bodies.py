@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 import taisoft as ts
+from taisoft.mesh.quality import volume_moments
 from taisoft.scene.fingerprint import scene_digest
 from taisoft.scene.plan import make_plan
 from taisoft.scene.refine import refined
-from taisoft.scene.rigid import RigidBody, volume_moments
+from taisoft.scene.rigid import RigidBody
 from tests.collision.rotations import rotation
 
 G = 9.81

@@ -228,13 +228,13 @@ def test_contact_numbers_follow_from_both_colliders_or_are_set(scene):
 def test_a_snapshot_does_not_follow_later_changes(scene):
     scene.set_contact("a", "b", friction=0.7)
     scene.collision = CollisionSettings(k_dop=14)
-    twin = scene.snapshot()
+    companion = scene.snapshot()
     scene.set_contact("a", "b", friction=0.1)
     scene.add_obstacle(Box((0, 0, 0), (1, 1, 1)))
     scene.collision = CollisionSettings()
     scene.body("a").collision = "distance_field"
-    assert twin.contact_numbers("a", "b") == (0.7, 0.3) and len(twin.obstacles) == 2 and twin.collision.k_dop == 14
-    assert twin.body("a").contact_mode == "proximity" and scene.body("a").contact_mode == "distance_field"
+    assert companion.contact_numbers("a", "b") == (0.7, 0.3) and len(companion.obstacles) == 2 and companion.collision.k_dop == 14
+    assert companion.body("a").contact_mode == "proximity" and scene.body("a").contact_mode == "distance_field"
 
 
 def test_invalid_collision_settings_are_refused():

@@ -191,7 +191,7 @@ def test_runs_that_have_to_foresee_motion_refuse_commands(refusing):
         sim.set_pose("wall", (0, 0, 0))
 
     report = refusing.run(2 * DT, fps=None, error=True, on_frame=command_within)
-    assert report.status == "failed" and "set_pose: the twins of a run with error=True do not follow" in report.problems[0]
+    assert report.status == "failed" and "set_pose: the companions of a run with error=True do not follow" in report.problems[0]
     refusing.set_pose("wall", (0, 0, 0))
     with pytest.raises(ts.SimulationError, match="^error=True: 'wall' follows a command"):
         refusing.run(DT, error=True)

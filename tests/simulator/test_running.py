@@ -258,7 +258,7 @@ def test_ctrl_c_within_a_step_abandons_it(monkeypatch):
         sim.advance(1)
         before = sim.positions(), sim.velocities()
         monkeypatch.setattr(StageSystem, "form_matrix", interrupted)
-        for _ in range(2):  # with twins, which the first run must end
+        for _ in range(2):  # with companions, which the first run must end
             with pytest.raises(KeyboardInterrupt):
                 sim.run(0.4, fps=None, error=True)
         assert sim.step_count == 1

@@ -24,7 +24,7 @@ from taisoft.contact import SOLVERS
 from taisoft.dynamics.schemes import CHOICES
 from taisoft.scene.laws import SHIPPED
 from taisoft.settings import IMPLICIT_CONTACT, Settings
-from taisoft.view.keys import KEYS, MOUSE
+from taisoft.view.window.keys import KEYS, MOUSE
 
 ROOT = Path(__file__).resolve().parents[2]
 DOCS = ROOT / "docs"

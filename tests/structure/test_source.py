@@ -27,7 +27,7 @@ TEST_FILES = sorted(TESTS.rglob("*.py"))
 
 # Modules and packages under taisoft/, left to right; those of one group may import one another, except the pairs in FORBIDDEN.
 ORDER = (
-    ("errors", "records", "files", "nested", "ranges", "machine", "processes", "compile_message", "display"),
+    ("errors", "records", "files", "nested", "ranges", "machine", "processes", "compile_message", "display", "view.choices"),
     ("attributes",),
     ("backend.private", "backend.blas"),
     ("backend.tracing", "backend.device_memory"),
@@ -58,7 +58,8 @@ ORDER = (
     ("output.appearance", "output.smoothing", "view.shading", "view.drawn"),
     ("view.colouring", "view.raster"),
     ("output.connection_lines",),
-    ("view.connection_layer", "view.ground", "view.sampling"),
+    ("view.ground", "view.sampling"),
+    ("view.layers",),
     ("view.scene_view", "view.shadow"),
     (
         *("simulator", "queries", "contact_queries", "changes", "commanding", "energy_check", "frames", "running", "static"),

@@ -6,8 +6,8 @@ import pytest
 import taisoft as ts
 from taisoft.nested import from_json, to_json
 from taisoft.view.drawn import DrawnScene, DrawnState
-from taisoft.view.ggui import vulkan_missing
 from taisoft.view.sampling import Sampler
+from taisoft.view.window.ggui import vulkan_missing
 from tests.dynamics.scenes import rubber
 from tests.view.fake_simulator import beam_scene
 
@@ -24,6 +24,12 @@ def body_mask(image):
     """Coloured pixels: the background is grey."""
     rgb = image.astype(int)
     return rgb.max(axis=2) - rgb.min(axis=2) > 20
+
+
+def pixels(canvas) -> np.ndarray:
+    """The drawn picture of a canvas, uint8 (height, width, 3), first row on top."""
+    buffer = canvas.window.get_image_buffer_as_numpy()  # float32 (width, height, 4) in [0, 1], first row below
+    return (255 * buffer[:, :, :3] + 0.5).astype(np.uint8).transpose(1, 0, 2)[::-1]
 
 
 def sampled(sim, layers=(), *kinds):

@@ -11,7 +11,7 @@ from taisoft.errors import SimulationError
 from taisoft.frames import fit_dt
 from taisoft.records import RunReport, StepReport
 from taisoft.settings import Settings
-from taisoft.view.live import LiveRun
+from taisoft.view.window.live import LiveRun
 from tests.view.drawing import cubes_scene
 from tests.view.fake_simulator import FakeSimulator, beam_scene
 

@@ -12,14 +12,15 @@ from taisoft.backend.runtime import open_kind, open_runtime
 from taisoft.errors import OutputError, SimulationError
 from taisoft.mesh.placing import FROM_Y_UP
 from taisoft.output.viewpoint import Viewpoint, start_positions
-from taisoft.view.colouring import COLOURS, Colouring, lit_colours, round_up
-from taisoft.view.ggui import Canvas
+from taisoft.view.colouring import GRADIENT, Colouring, lit_colours, round_up
+from taisoft.view.layers import IMPULSE_COLOUR, NORMAL_COLOUR, TRACTION_COLOUR, WIRE_COLOUR
 from taisoft.view.offscreen import Offscreen, stroke
 from taisoft.view.raster import Raster
-from taisoft.view.scene_view import IMPULSE_COLOUR, MARKER_COLOUR, NORMAL_COLOUR, TRACTION_COLOUR, WIRE_COLOUR, Surfaces
-from taisoft.view.window import show
+from taisoft.view.scene_view import MARKER_COLOUR, Surfaces
+from taisoft.view.window.ggui import Canvas
+from taisoft.view.window.window import show
 from tests.dynamics.scenes import rubber
-from tests.view.drawing import SIZE, body_mask, needs_vulkan, sampled
+from tests.view.drawing import SIZE, body_mask, needs_vulkan, pixels, sampled
 from tests.view.fake_simulator import FakeSimulator, beam_scene
 
 LARGE = (640, 360)
@@ -113,7 +114,7 @@ def test_layers_are_drawn_where_they_are_seen():
     dark = (fixed < 60).all(axis=2)
     assert dark.sum() > 50 and not (plain < 60).all(axis=2).any(), "fixed nodes are dark balls"
     assert np.array_equal(Offscreen(scene, LARGE).image(sim), fixed), "a default layer"
-    with pytest.raises(OutputError, match="layer must be one of wires, contacts, .*, not 'wire'; did you mean 'wires'"):
+    with pytest.raises(OutputError, match="layer must be one of contacts, tractions, .*, not 'wire'; did you mean 'wires'"):
         Offscreen(scene, SIZE, layers=("wire",))
 
 
@@ -140,7 +141,7 @@ def test_a_stretched_bar_has_its_stretch_at_every_node(order):
     assert np.allclose(state.values["stretch"], 1.3)
     colouring.base(state)
     assert colouring.low == 1.0 and colouring.span == pytest.approx(0.5)
-    assert colouring.legend()[0][0].strip() == "1.5" and np.array_equal(colouring.legend()[0][1], COLOURS[-1])
+    assert colouring.legend()[0][0].strip() == "1.5" and np.array_equal(colouring.legend()[0][1], GRADIENT[-1])
 
 
 def with_speed(sim, speed):
@@ -260,7 +261,7 @@ def test_a_process_has_one_window_which_leaves_no_files(tmp_path, monkeypatch):
     surfaces = Surfaces(beam_scene())
     first = Canvas(surfaces, SIZE, visible=False)
     try:
-        first.pixels(0, 0, *SIZE)
+        pixels(first)
         with pytest.raises(OutputError, match="a window holds the only one a process can have"):
             Canvas(surfaces, SIZE, visible=False)
         with pytest.raises(SimulationError, match="a window is open"):
@@ -289,7 +290,7 @@ def test_the_window_blends_transparent_surfaces_from_far_to_near():
         try:
             for _ in range(2):  # the first picture of a window may be empty
                 canvas.draw(x, colours, FRONT, (1, 1, 1), lines)
-                shown = canvas.pixels(0, 0, *SIZE).astype(int)
+                shown = pixels(canvas).astype(int)
         finally:
             canvas.close()
         expected = drawing.image(state)
@@ -306,7 +307,7 @@ def test_lines_that_are_gone_are_not_drawn_any_more():
     try:
         for rows in (2, 4, 2):
             canvas.draw(np.zeros((n, 3)), np.zeros((n, 3)), camera, (1, 1, 1), (ends[:rows], red[:rows]))
-            pictures.append(canvas.pixels(0, 0, *SIZE))
+            pictures.append(pixels(canvas))
     finally:
         canvas.close()
     assert np.array_equal(pictures[0], pictures[2]) and not np.array_equal(pictures[0], pictures[1])

@@ -132,7 +132,7 @@ def test_invisible_triangles_are_skipped():
     bad = [good.copy() for _ in range(9)]
     bad[0][1, 2], bad[1][2, 2] = NEAR, -1.0
     bad[2][0, 0], bad[3][1, 1], bad[4][2, 2] = np.nan, np.inf, np.nan
-    bad[5][0, 0] = 1e7
+    bad[5][0, 0] = 1e11
     bad[6][:] = good[0]
     bad[7][:, 0] -= 500.0
     bad[8][:, 2] = np.inf, np.nan, -np.inf

@@ -8,7 +8,7 @@ import pytest
 from taisoft.errors import OutputError
 from taisoft.view.drawn import DrawnScene
 from taisoft.view.link import Viewer
-from taisoft.view.window import LiveWindow, WindowProcess, show
+from taisoft.view.window.window import LiveWindow, WindowProcess, show
 from tests.view.desktop import ROOT, TOOLS, Desktop
 from tests.view.drawing import body_mask, needs_vulkan, program
 from tests.view.fake_simulator import FakeSimulator, beam_scene
@@ -30,7 +30,7 @@ SHOWN = {"status": "", "messages": []}
 def simulator(monkeypatch):
     """A simulator to show; nothing that windows need is missing."""
     for name in ("display_missing", "vulkan_missing"):
-        monkeypatch.setattr(f"taisoft.view.window.{name}", lambda: "")
+        monkeypatch.setattr(f"taisoft.view.window.window.{name}", lambda: "")
     monkeypatch.setenv("PYTHONPATH", str(ROOT))
     return FakeSimulator(beam_scene())
 
@@ -82,11 +82,11 @@ def test_a_window_that_does_not_open_is_an_error(simulator):
 
 def test_a_lost_window_is_an_error_but_a_run_goes_on(simulator, monkeypatch):
     sim, lose = simulator, OPEN + "link.receive(None); import os; os.kill(os.getpid(), 11)"
-    monkeypatch.setattr("taisoft.view.window.CHILD", program(lose))
+    monkeypatch.setattr("taisoft.view.window.window.CHILD", program(lose))
     sim.advance = lambda n: sim.step()
     with pytest.raises(OutputError, match="^the window is lost: its process ended by signal SIGSEGV$"):
         show(sim, fps=None)
-    monkeypatch.setattr("taisoft.view.window.CHILD", program(OPEN + "link.receive(None); sys.exit(3)"))
+    monkeypatch.setattr("taisoft.view.window.window.CHILD", program(OPEN + "link.receive(None); sys.exit(3)"))
     window, index = LiveWindow(sim), 0
     with pytest.warns(UserWarning, match="is lost: its process ended with exit status 3; the run continues without it"):
         while not window.closed and index < 1000:
@@ -118,7 +118,7 @@ os.chdir({folder!r})
 from tests.view.fake_simulator import beam_scene
 import taisoft as ts
 from taisoft.backend.runtime import compile_clock
-from taisoft.view.window import show
+from taisoft.view.window.window import show
 
 
 class PrintingSimulator(ts.Simulator):

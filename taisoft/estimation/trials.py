@@ -1,7 +1,7 @@
-"""Pilots: runs of a whole simulation with trial steps, whose differences show which steps meet a tolerance.
+"""Trials: runs of a whole simulation with trial steps, whose differences show which steps meet a tolerance.
 
-A pilot takes steps of the run's own simulator, which afterwards is in the state that it had before. Pilots are compared at
-common frames, at some of their nodes, so that their paths take little memory. A pilot keeps the state before its hardest part,
+A trial takes steps of the run's own simulator, which afterwards is in the state that it had before. Trials are compared at
+common frames, at some of their nodes, so that their paths take little memory. A trial keeps the state before its hardest part,
 the one in which velocities change most from frame to frame, or also before its fastest one: other steps are compared with it
 there for a small part of the cost.
 """
@@ -28,14 +28,14 @@ if TYPE_CHECKING:
 NEGLIGIBLE = {"f32": 1e-6, "f64": 1e-12}  # excursions, over the size of the scene, that are rounding
 ROUNDING = 1e-6  # part of a frame that a run's length may lack of a whole one
 MAX_FRAMES = 48  # at which paths are recorded
-PARTS = 24  # of a run, about; a pilot knows which is the hardest
+PARTS = 24  # of a run, about; a trial knows which is the hardest
 MAX_NODES = 4096  # whose paths are recorded, evenly spread
 HARDEST, FASTEST = "hardest", "fastest"  # parts: of the largest changes of velocities, and of the largest velocities
 
 
 @dataclass(frozen=True)
 class Part:
-    """A part of a pilot: its first frame, the state there, and the pilot's sum of what distinguishes the part over that in it."""
+    """A part of a trial: its first frame, the state there, and the trial's sum of what distinguishes the part over that in it."""
 
     first: int
     state: dict
@@ -43,8 +43,8 @@ class Part:
 
 
 @dataclass
-class Pilot:
-    """A pilot, or the run itself. per_frame: its steps in the time of a frame.
+class Trial:
+    """A trial, or the run itself. per_frame: its steps in the time of a frame.
 
     positions: of the recorded nodes (n,3) [m], by the numbers of the recorded frames; variations: (n,) sums of the changes, from
     frame to frame, of what velocities change in a frame; jump: the largest such change of velocity [m/s]; end: the simulation's
@@ -78,14 +78,14 @@ class Pilot:
 
 
 class Recorder:
-    """Records a pilot at its frames; pass `frame` to a run as on_frame.
+    """Records a trial at its frames; pass `frame` to a run as on_frame.
 
     stride: time between these, in frames of `frames`; first: the one at which it begins; keeps: parts before which to keep the
     state.
     """
 
-    def __init__(self, pilot: Pilot, frames: "Frames", stride: Fraction, first: int = 0, keeps: tuple[str, ...] = ()):
-        self._pilot, self._frames, self._first, self._keeps = pilot, frames, first, keeps
+    def __init__(self, trial: Trial, frames: "Frames", stride: Fraction, first: int = 0, keeps: tuple[str, ...] = ()):
+        self._trial, self._frames, self._first, self._keeps = trial, frames, first, keeps
         self._stride = stride if stride.denominator > 1 else int(stride)
         self._index: int | None = None  # of the first frame
         self._velocities: np.ndarray | None = None  # (n,3) at the frame before
@@ -97,13 +97,13 @@ class Recorder:
     def frame(self, sim: "Simulator", index: int, _report) -> None:
         """Record a frame, unless it lies between those of `frames`, or is the last one and not whole."""
         self._index = index if self._index is None else self._index
-        number, pilot, frames = self._first + (index - self._index) * self._stride, self._pilot, self._frames
+        number, trial, frames = self._first + (index - self._index) * self._stride, self._trial, self._frames
         if number.denominator != 1 or number > frames.count:
             return
         number, state = int(number), sim._dynamics.state
         if frames.is_recorded(number):
             x, v = state.state()
-            pilot.positions[number] = x[frames.nodes].astype(np.float64)
+            trial.positions[number] = x[frames.nodes].astype(np.float64)
         else:
             v = state.velocities()
         self._add_changes(v[frames.nodes].astype(np.float64))
@@ -112,13 +112,13 @@ class Recorder:
 
     def _add_changes(self, velocities: np.ndarray) -> None:
         """Add the changes to the velocities (n,3) [m/s] of the next frame."""
-        pilot = self._pilot
+        trial = self._trial
         if self._velocities is not None:
             jump = velocities - self._velocities
             lengths = _lengths(jump)
-            pilot.jump = max(pilot.jump, float(lengths.max()))
+            trial.jump = max(trial.jump, float(lengths.max()))
             changes = lengths if self._jump is None else _lengths(jump - self._jump)
-            pilot.variations = pilot.variations + (0.0 if self._jump is None else changes)
+            trial.variations = trial.variations + (0.0 if self._jump is None else changes)
             for name in self._keeps:
                 self._sums[name] = self._sums[name] + (changes if name == HARDEST else _lengths(velocities))
             self._jump = jump
@@ -130,16 +130,16 @@ class Recorder:
             found = float(np.max(self._sums[name]))
             self._total[name] += found
             if found > self._most[name]:
-                self._most[name], self._pilot.parts[name] = found, self._part
+                self._most[name], self._trial.parts[name] = found, self._part
             times = self._total[name] / self._most[name] if self._most[name] > 0.0 else 1.0
-            self._pilot.parts[name] = replace(self._pilot.parts[name], times=times)
+            self._trial.parts[name] = replace(self._trial.parts[name], times=times)
         self._part = Part(number, state) if state else None
         self._sums = dict.fromkeys(self._keeps, 0.0)
 
 
 @dataclass(frozen=True)
 class Frames:
-    """The frames of a run at which pilots are compared.
+    """The frames of a run at which trials are compared.
 
     seconds: between two frames [s]; length: of the run [s]; nodes: the recorded ones; bodies: (n,) their bodies; negligible: an
     excursion that is rounding [m].
@@ -157,7 +157,7 @@ class Frames:
         return max(1, math.floor(self.length / self.seconds + ROUNDING))
 
     def is_recorded(self, frame: int) -> bool:
-        """Whether pilots record a frame, counted from 0 at the start: at most about MAX_FRAMES, and the last one."""
+        """Whether trials record a frame, counted from 0 at the start: at most about MAX_FRAMES, and the last one."""
         return frame % self._between == 0 or frame == self.count
 
     @cached_property
@@ -170,7 +170,7 @@ class Frames:
         """Frames of a part of the run; the last part may have fewer."""
         return self._between * max(1, round(self.count / (self._between * PARTS)))
 
-    def pilot(
+    def trial(
         self,
         sim: "Simulator",
         per_frame: Fraction,
@@ -178,13 +178,13 @@ class Frames:
         part: Part | None = None,
         keeps: tuple[str, ...] = (),
         on_step: StepCallback | None = None,
-    ) -> Pilot:
-        """Run a pilot of `per_frame` steps a frame; its report has the status "failed" if it fails. Restores sim's state.
+    ) -> Trial:
+        """Run a trial of `per_frame` steps a frame; its report has the status "failed" if it fails. Restores sim's state.
 
-        part: of another pilot, which alone is to be run; keeps: own parts before which to keep the state; stop, on_step: as for
+        part: of another trial, which alone is to be run; keeps: own parts before which to keep the state; stop, on_step: as for
         `Simulator.run`.
         """
-        pilot = Pilot(sim.settings.integrator, per_frame)
+        trial = Trial(sim.settings.integrator, per_frame)
         kept, may_soften = sim._dynamics.snapshot(), sim._may_soften
         stride, first = math.ceil(1 / per_frame), 0
         length = self.length if stride == 1 else self.count // stride * stride * self.seconds
@@ -194,16 +194,16 @@ class Frames:
         try:
             if part is not None:
                 sim._dynamics.restore(part.state)
-            with collected_warnings() as pilot.warned:  # which the run has only if the pilot is the run
+            with collected_warnings() as trial.warned:  # which the run has only if the trial is the run
                 sim.dt = self.seconds / float(per_frame)
-                recorder = Recorder(pilot, self, Fraction(stride), first, keeps)
+                recorder = Recorder(trial, self, Fraction(stride), first, keeps)
                 request = RunRequest(length, 1.0 / (self.seconds * stride), stop, on_frame=recorder.frame, on_step=on_step)
-                pilot.report = run_steps(sim, request)
-            pilot.end = sim._dynamics.snapshot()
+                trial.report = run_steps(sim, request)
+            trial.end = sim._dynamics.snapshot()
         finally:
             sim._dynamics.restore(kept)
             sim._may_soften = may_soften
-        return pilot
+        return trial
 
 
 def make_frames(sim: "Simulator", length: float, seconds: float) -> Frames:
@@ -215,10 +215,10 @@ def make_frames(sim: "Simulator", length: float, seconds: float) -> Frames:
     return Frames(seconds, length, nodes, bodies[nodes], NEGLIGIBLE[sim.settings.precision] * size)
 
 
-def distances(pilot: Pilot, other: Pilot) -> np.ndarray:
-    """Distances of two pilots' nodes at their common frames (k,n) [m]."""
-    common = [frame for frame in pilot.positions if frame in other.positions]
-    return np.linalg.norm([pilot.positions[frame] - other.positions[frame] for frame in common], axis=2)
+def distances(trial: Trial, other: Trial) -> np.ndarray:
+    """Distances of two trials' nodes at their common frames (k,n) [m]."""
+    common = [frame for frame in trial.positions if frame in other.positions]
+    return np.linalg.norm([trial.positions[frame] - other.positions[frame] for frame in common], axis=2)
 
 
 def _lengths(vectors: np.ndarray) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""The process of the live window: `python -m taisoft.view.window_process MEMORY`, see `taisoft.view.link`.
+"""The process of the live window: `python -m taisoft.view.window.window_process MEMORY`, see `taisoft.view.link`.
 
 It gets a description of the scene, then states, and sends what the window shows and which commands the user has given. It ends
 when the window is closed, and with the link.
@@ -9,8 +9,8 @@ import time
 from taisoft.processes import Link
 from taisoft.view.drawn import DrawnScene, DrawnState
 from taisoft.view.link import SharedNodes, serve
-from taisoft.view.panel import Requests
-from taisoft.view.screen import Screen
+from taisoft.view.window.panel import Requests
+from taisoft.view.window.screen import Screen
 
 MAX_UNANSWERED = 64  # requests; later commands wait, so that a long step lets no queue grow
 IDLE_SHARE = 1.0  # time without drawing over that of drawing: with software Vulkan, drawing takes cores from the simulation

@@ -4,6 +4,8 @@ from dataclasses import dataclass
 
 import taichi as ti
 
+from taisoft.view.choices import NODAL
+
 
 @dataclass(frozen=True)
 class Key:
@@ -26,13 +28,12 @@ KEYS = (
     Key(("b",), "B", "budget", "budget", "end steps on a budget of wall time, or solve them"),
     Key(("h",), "H", "frame", "frame the bodies", "frame the bodies"),
     Key(("l",), "L", "follow", "follow them", "the camera follows the bodies, or stays"),
-    Key(("v",), "V", "colour", "colours", "colour bodies by stress, stretch, speed, pressure, slip or body"),
+    Key(("v",), "V", "colour", "colours", f"colour bodies by {', '.join(NODAL[:-2])}, {NODAL[-2]} or body"),
     Key(("w",), "W", "wires", "wires", "wires"),
     Key(("c",), "C", "contacts", "contacts", "contacts: normals green, impulses red"),
     Key(("t",), "T", "tractions", "tractions", "tractions"),
     Key(("f",), "F", "fixed_nodes", "fixed nodes", "fixed nodes"),
     Key(("d",), "D", "shadows", "shadows", "shadows on half-spaces"),
-    Key(("i",), "I", "screenshot", "picture", "write a picture, without the panel, to `out/window-1.png`"),
     Key((ti.ui.ESCAPE,), "Escape", "close", "end", "end"),
 )
 MOUSE = (

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from taisoft.mesh.solids import ray_hits
+from taisoft.mesh.distances import ray_hits
 from taisoft.output.viewpoint import Viewpoint
 from taisoft.view.drawn import DrawnState
 
@@ -32,16 +32,6 @@ class Hit:
     point: np.ndarray
 
 
-def nearest_hit(origin: np.ndarray, direction: np.ndarray, x: np.ndarray, triangles: np.ndarray) -> tuple[int, np.ndarray] | None:
-    """Return the first triangle hit by a ray from origin, and the point's barycentric weights (3,); None if there is no hit.
-
-    triangles: (t,3); x: their vertices (n,3).
-    """
-    along, u, v = ray_hits(x[triangles], origin, direction)
-    t = int(np.argmin(along))
-    return None if np.isinf(along[t]) else (t, np.array([1 - u[t] - v[t], u[t], v[t]]))
-
-
 def pick(state: DrawnState, camera: Viewpoint, cursor: tuple[float, float], size: tuple[int, int]) -> Hit | None:
     """Return the point of a body under the cursor, or None.
 
@@ -51,10 +41,11 @@ def pick(state: DrawnState, camera: Viewpoint, cursor: tuple[float, float], size
     for k, body in enumerate(state.scene.bodies):
         skin, x = body.weights, state.positions(body.name)
         shown, triangles = (x, body.surface) if skin is None else (skin @ x, body.triangles)
-        found = nearest_hit(camera.position, direction, shown, np.asarray(triangles))
-        if found is None:
+        along, u, v = ray_hits(shown[triangles], camera.position, direction)
+        t = int(np.argmin(along))
+        if np.isinf(along[t]):
             continue
-        corners, weights = triangles[found[0]], found[1]
+        corners, weights = triangles[t], np.array([1.0 - u[t] - v[t], u[t], v[t]])
         point = weights @ shown[corners]
         depth = float(np.linalg.norm(point - camera.position))
         if depth < distance:

@@ -1,5 +1,5 @@
-"""Error estimates by twins, mostly of stand-ins whose errors are known: in time, of the solvers and of the mesh, by body, at
-nodes and so far; what leaves an error unknown is noted; a run of a real simulator goes on as without twins.
+"""Error estimates by companions, mostly of stand-ins whose errors are known: in time, of the solvers and of the mesh, by body, at
+nodes and so far; what leaves an error unknown is noted; a run of a real simulator goes on as without companions.
 """
 
 import numpy as np
@@ -7,8 +7,8 @@ import pytest
 
 import taisoft as ts
 from taisoft.errors import SimulationError
+from taisoft.estimation.companions import on_mesh, other_mesh, other_steps, tighter
 from taisoft.estimation.comparison import Differences
-from taisoft.estimation.twins import on_mesh, other_mesh, other_steps, tighter
 from taisoft.running import run
 from taisoft.stability import stable_dt
 from tests.dynamics.scenes import cube, rubber
@@ -36,10 +36,10 @@ def test_free_fall_in_steps_of_implicit_euler():
     assert e.excursion == pytest.approx(5.0 * (1.0 + 1 / 64), rel=1e-6) and e.order == pytest.approx(1.0)
     assert e.time * e.excursion == pytest.approx(5.0 / 64) and e.solver * e.excursion == pytest.approx(0.5e-3)
     assert e.space is None and e.total == pytest.approx(e.time + e.solver) and not e.notes
-    assert e.twins == ["dt = 0.03125 s", "dt = 0.0625 s", "tolerances x 0.1"] and set(e.bodies) == {"block", "fine"}
+    assert e.companions == ["dt = 0.03125 s", "dt = 0.0625 s", "tolerances x 0.1"] and set(e.bodies) == {"block", "fine"}
     assert e.bodies["fine"].time == e.time and e.bodies["block"].solver == e.solver
     assert e.energies.gravity == pytest.approx(-10.0 * len(sim.rest) * 5.0 / 64) and e.energies.kinetic == 0.0
-    assert len(kind.made) == 4 and all(twin.closed for twin in kind.made[1:]) and not sim.closed
+    assert len(kind.made) == 4 and all(companion.closed for companion in kind.made[1:]) and not sim.closed
 
 
 def test_the_largest_difference_of_each_body_up_to_a_time():
@@ -52,11 +52,11 @@ def test_the_largest_difference_of_each_body_up_to_a_time():
 
 def test_few_or_unstable_steps_are_compared_with_half_the_step():
     e = estimate(FALLING(block(), dt=1 / 16), 0.5)
-    assert e.twins[0] == "dt = 0.03125 s" and len(e.twins) == 2 and e.order == 1.0
+    assert e.companions[0] == "dt = 0.03125 s" and len(e.companions) == 2 and e.order == 1.0
     assert e.time * e.excursion == pytest.approx(5.0 * 0.5 / 16)
     kind = motion(stable_dt=3.9 / 60, offset=lambda sim: (0.0, 9.0 * sim.dt**2 * sim.time, 0.0))  # 4 dt would be unstable
     sim = kind(block(), 1 / 60, VERLET)
-    assert [[twin.ratio for twin in other_steps(FALLING(block(), 1 / 60), n)] for n in (31, 32)] == [[0.5], [2, 4]]
+    assert [[companion.ratio for companion in other_steps(FALLING(block(), 1 / 60), n)] for n in (31, 32)] == [[0.5], [2, 4]]
     (half,) = other_steps(sim, 32)
     half.follow(3)
     assert (half.ratio, half.sim.step_count, half.sim.time) == (0.5, 6, pytest.approx(0.05))
@@ -83,11 +83,11 @@ def test_errors_of_the_mesh():
         errors = 5.0 * (1.0 + 1 / 64) * 5.0 ** (-2.0 / 3.0) * np.array(errors)
         found = [body.space * e.excursion for body in e.bodies.values()]
         assert found == pytest.approx(errors, rel=1e-6) and e.space == max(body.space for body in e.bodies.values())
-        assert e.twins[0] == f"mesh: {mesh}" and e.total == pytest.approx(e.time + e.space + e.solver)
+        assert e.companions[0] == f"mesh: {mesh}" and e.total == pytest.approx(e.time + e.space + e.solver)
     sim = kind(two_blocks(), 0.8 * stable_dt(two_blocks(), verlet=True), VERLET)
-    twin = on_mesh(sim, "refined")[0]  # its steps are stable on its mesh
-    assert twin.steps > 1 and twin.steps * twin.sim.dt == pytest.approx(sim.dt)
-    assert twin.sim.dt < stable_dt(twin.sim.scene, verlet=True)
+    companion = on_mesh(sim, "refined")[0]  # its steps are stable on its mesh
+    assert companion.steps > 1 and companion.steps * companion.sim.dt == pytest.approx(sim.dt)
+    assert companion.sim.dt < stable_dt(companion.sim.scene, verlet=True)
 
 
 def test_errors_at_the_nodes_and_so_far():
@@ -127,11 +127,11 @@ def test_paths_that_part_are_noticed():
     assert e.time is None and 0.4 < e.agree_until < 0.7 and 0.0 < e.time_until_then < 0.1
     assert set(e.spread_after) == {"block", "fine"} and all(spread > 0.1 for spread in e.spread_after.values())
     assert e.solver is None and "part after t = " in e.notes[0] and "solver is unknown, since the paths part" in e.notes[1]
-    few = estimate(motion(offset=parting)(block(), 1 / 16, BDF2), 1.0)  # one twin
+    few = estimate(motion(offset=parting)(block(), 1 / 16, BDF2), 1.0)  # one companion
     assert few.time is None and "with half the step some node is over 10%" in few.notes[0] and few.agree_until <= 0.5
 
 
-def test_failed_and_unconverged_twins():
+def test_failed_and_unconverged_companions():
     def fails_with(test) -> type[StandIn]:
         def before_step(sim):
             if test(sim) and sim.time > 0.5:
@@ -142,10 +142,10 @@ def test_failed_and_unconverged_twins():
     e = estimate(fails_with(lambda sim: sim.dt > 1 / 50)(block()))
     assert e.time is None and e.solver is not None and "dt = 0.03125 s failed: made to fail" in e.notes[0]
     e = estimate(fails_with(lambda sim: sim.settings.newton_tolerance)(block()))
-    assert e.notes == ["the error of solver is unknown: its twin (tolerances x 0.1) failed: made to fail"]
+    assert e.notes == ["the error of solver is unknown: its companion (tolerances x 0.1) failed: made to fail"]
     assert e.time > 0.0 and e.solver is None
     e = estimate(motion(unconverged=lambda sim: bool(sim.settings.newton_tolerance))(block()))
-    assert e.notes == ["of the twin with tolerances x 0.1, 64 of 64 steps did not converge"] and e.solver is not None
+    assert e.notes == ["of the companion with tolerances x 0.1, 64 of 64 steps did not converge"] and e.solver is not None
 
 
 @pytest.mark.parametrize(
@@ -211,14 +211,14 @@ def test_a_body_on_another_mesh_may_be_placed_a_little_differently():
     assert found[0] == pytest.approx(found[1]) and found[0] > 0.0
 
 
-def test_a_broken_run_releases_its_twins():
+def test_a_broken_run_releases_its_companions():
     kind = motion()
     with pytest.raises(ZeroDivisionError):
         run(kind(block()), 1.0, lambda *_: 1 / 0, 16, error=True)
     assert [one.closed for one in kind.made] == [False, True, True, True]
 
 
-def test_a_real_run_goes_on_as_without_twins():
+def test_a_real_run_goes_on_as_without_companions():
     """From a state in motion. Its error is of the right size, is known at the nodes during the run, and excludes another run."""
     ends, seen = [], []
 

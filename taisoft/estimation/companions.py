@@ -1,4 +1,4 @@
-"""Twins: simulators that accompany a run with other settings, or on another mesh, from the same state.
+"""Companions: simulators that accompany a run with other settings, or on another mesh, from the same state.
 
 All of them take whole steps, and meet the run at the times of the comparisons.
 """
@@ -23,19 +23,19 @@ if TYPE_CHECKING:
     from taisoft.simulator import Simulator
 
 MIN_STEPS = 32  # of a run whose error is estimated by larger steps
-TIGHTER = 0.1  # a twin's tolerances over those of the run; much less takes many iterations, and in f32 meets rounding
-REFINED, ORDER = "refined", "order"  # meshes of a twin, besides a scene
+TIGHTER = 0.1  # a companion's tolerances over those of the run; much less takes many iterations, and in f32 meets rounding
+REFINED, ORDER = "refined", "order"  # meshes of a companion, besides a scene
 MESHES = (REFINED, ORDER)
 MIN_WIDTH_RATIO = 1.2  # of two meshes: below it chance rules their difference
 PLACED = 1e-2  # largest distance of bodies in two scenes, over the size of the first
 SAME_STATE = 1e-6  # largest distance of shared nodes at the start, over the size of the scene
 
 
-class Twin:
-    """One twin. Nodes `own` of the run are compared with nodes `theirs` of the twin. failed: the reason, if it did, else "".
+class Companion:
+    """One companion. Nodes `own` of the run are compared with nodes `theirs` of the companion.
 
-    what: in words; ratio: of its step, or mesh width, over the run's; steps: taken while the run takes `per` steps. nodes: those
-    of both, and the vector [m] from where the former start to the latter.
+    failed: the reason, if it did, else ""; what: in words; ratio: of its step, or mesh width, over the run's; steps: taken while
+    the run takes `per` steps. nodes: those of both, and the vector [m] from where the former start to the latter.
     """
 
     def __init__(self, what: str, sim: "Simulator", ratio: float, steps=1, per=1, nodes=(slice(None), slice(None), 0.0)):
@@ -61,18 +61,18 @@ class Twin:
         return self.sim.positions()[self.theirs] - self._shift
 
 
-def other_steps(sim: "Simulator", steps: int) -> Iterator[Twin]:
-    """Twins of a run of `steps` steps: with twice and four times the step, but half of it for few steps, or where explicit ones
-    would be unstable."""
+def other_steps(sim: "Simulator", steps: int) -> Iterator[Companion]:
+    """Companions of a run of `steps` steps: with twice and four times the step, but half of it for few steps, or where explicit
+    ones would be unstable."""
     if steps >= MIN_STEPS and not (sim.settings.explicit and 4.0 * sim.dt > STABLE_FRACTION * sim.stable_dt):
         for ratio in (2, 4):
-            yield Twin(f"dt = {ratio * sim.dt:.4g} s", sim._copy(dt=ratio * sim.dt, budget=None), ratio, per=ratio)
+            yield Companion(f"dt = {ratio * sim.dt:.4g} s", sim._copy(dt=ratio * sim.dt, budget=None), ratio, per=ratio)
     else:
-        yield Twin(f"dt = {0.5 * sim.dt:.4g} s", sim._copy(dt=0.5 * sim.dt, budget=None), 0.5, steps=2)
+        yield Companion(f"dt = {0.5 * sim.dt:.4g} s", sim._copy(dt=0.5 * sim.dt, budget=None), 0.5, steps=2)
 
 
-def tighter(sim: "Simulator") -> Twin | None:
-    """A twin with tighter tolerances of all solvers; None if nothing is solved."""
+def tighter(sim: "Simulator") -> Companion | None:
+    """A companion with tighter tolerances of all solvers; None if nothing is solved."""
     given, precision = sim.settings, sim.settings.precision
     used = {"linear_tolerance": given.linear_tolerance} if given.linear_tolerance else {}
     if not given.explicit:
@@ -80,14 +80,14 @@ def tighter(sim: "Simulator") -> Twin | None:
     if sim.touches:
         used["contact_tolerance"] = given.contact_tolerance or CONTACT_TOLERANCE[precision]
     tight = {name: TIGHTER * value for name, value in used.items()}
-    return Twin(f"tolerances x {TIGHTER:g}", sim._copy(**tight, budget=None), TIGHTER) if tight else None
+    return Companion(f"tolerances x {TIGHTER:g}", sim._copy(**tight, budget=None), TIGHTER) if tight else None
 
 
-def on_mesh(sim: "Simulator", mesh: str | Scene) -> tuple[Twin, list[float | None]]:
-    """A twin on another mesh: "refined", "order" (the other order of elements) or the scene itself on another mesh.
+def on_mesh(sim: "Simulator", mesh: str | Scene) -> tuple[Companion, list[float | None]]:
+    """A companion on another mesh: "refined", "order" (the other order of elements) or the scene itself on another mesh.
 
     Also return its mesh widths over those of the run, one a body, None where the order differs and of rigid bodies. Raises
-    SceneError or SimulationError if the twin cannot be made, does not start as the run does, or cannot show a body's error.
+    SceneError or SimulationError if the companion cannot be made, does not start as the run does, or cannot show a body's error.
     """
     scene = other_mesh(sim, mesh)
     ratios = [_width_ratio(*bodies) for bodies in zip(sim.scene.bodies, scene.bodies)]
@@ -106,12 +106,13 @@ def on_mesh(sim: "Simulator", mesh: str | Scene) -> tuple[Twin, list[float | Non
         other.close()
         raise
     what = mesh if isinstance(mesh, str) else f"{sum(b.mesh.n_tets for b in scene.bodies):,} tets"
-    return Twin(f"mesh: {what}", other, 1.0, steps, nodes=(*nodes, shift)), ratios
+    return Companion(f"mesh: {what}", other, 1.0, steps, nodes=(*nodes, shift)), ratios
 
 
 def _width_ratio(own: Body, other: Body) -> float | None:
-    """Mesh width of a body of a twin over that of the run; None if the orders differ, or the body is rigid. SimulationError if it
-    is near 1."""
+    """Mesh width of a body of a companion over that of the run; None if the orders differ, or the body is rigid. SimulationError
+    if
+    it is near 1."""
     if own.order != other.order or isinstance(own, RigidBody):
         return None
     ratio = (own.mesh.n_tets / other.mesh.n_tets) ** (1.0 / 3.0)
@@ -134,7 +135,7 @@ def _check_free(scene: Scene, shared: np.ndarray) -> None:
 
 
 def other_mesh(sim: "Simulator", mesh: str | Scene) -> Scene:
-    """The scene of a twin on another mesh. Raises SceneError or SimulationError if there is none."""
+    """The scene of a companion on another mesh. Raises SceneError or SimulationError if there is none."""
     if isinstance(mesh, Scene):
         names = [[b.name for b in scene.bodies] for scene in (sim.scene, mesh)]
         if names[0] != names[1]:
@@ -162,8 +163,8 @@ def _placement(sim: "Simulator") -> np.ndarray:
 
 
 def _check_start(sim: "Simulator", other: "Simulator", nodes: tuple[np.ndarray, np.ndarray], shift: np.ndarray) -> None:
-    """Raise SimulationError unless a twin on another mesh, which starts as its scene does, has the run's state, but for a shift
-    (k,3) [m] of at most PLACED, as of bodies that start at the contact offset."""
+    """Raise SimulationError unless a companion on another mesh, which starts as its scene does, has the run's state, but for a
+    shift (k,3) [m] of at most PLACED, as of bodies that start at the contact offset."""
     own, theirs = nodes
     x, v, dt = sim.positions(), sim.velocities(), max(sim.dt, 1.0 / 60.0)
     size = np.ptp(x, axis=0).max()
@@ -173,5 +174,5 @@ def _check_start(sim: "Simulator", other: "Simulator", nodes: tuple[np.ndarray, 
     faster = np.abs(v[own] - other.velocities()[theirs]).max() * dt
     if sim.time != other.time or max(apart, faster) > SAME_STATE * size:
         raise SimulationError(
-            "error_mesh: a twin on another mesh starts with the scene, so the run must start there too: reset()"
+            "error_mesh: a companion on another mesh starts with the scene, so the run must start there too: reset()"
         )

@@ -1,7 +1,7 @@
 """The live window, seen from the simulation: a process that shows it, and the calls that open one.
 
-The window runs in a process of its own, `taisoft.view.window_process`, so that it draws and answers the mouse while a step is
-computed. The simulation stays in the caller's process, whatever its scene holds, and only states and commands travel
+The window runs in a process of its own, `taisoft.view.window.window_process`, so that it draws and answers the mouse while a step
+is computed. The simulation stays in the caller's process, whatever its scene holds, and only states and commands travel
 (`taisoft.view.link`). So any arch and precision can be shown, a crash of the window does not end the simulation, and the window
 ends with its caller, however that ends.
 """
@@ -13,17 +13,17 @@ from taisoft.errors import OutputError
 from taisoft.frames import dt_sentence, fit_dt
 from taisoft.output.files import Observer
 from taisoft.records import RunReport, StepReport
-from taisoft.view.controls import touching_pairs
-from taisoft.view.ggui import display_missing, vulkan_missing
+from taisoft.view.choices import IN_WINDOW
 from taisoft.view.link import Viewer
-from taisoft.view.live import LiveRun
 from taisoft.view.sampling import Sampler
-from taisoft.view.scene_view import IN_WINDOW
+from taisoft.view.window.controls import touching_pairs
+from taisoft.view.window.ggui import display_missing, vulkan_missing
+from taisoft.view.window.live import LiveRun
 
 FAILURE = "cannot open a window"
 START_SECONDS = 60.0  # in which the window must open
 FPS = 60.0  # of the window's pictures, at most
-CHILD = ("-P", "-m", "taisoft.view.window_process")
+CHILD = ("-P", "-m", "taisoft.view.window.window_process")
 
 
 class WindowProcess(Viewer):
@@ -31,7 +31,7 @@ class WindowProcess(Viewer):
 
     sim: a Simulator; controls: whether the window changes it, or only shows it; colour, layers: those shown initially;
     child: arguments of Python that start the process, if not CHILD.
-    timing: once its user has closed it, times of its pictures and latencies of drags, see `taisoft.view.timing`. Raises
+    timing: once its user has closed it, times of its pictures and latencies of drags, see `taisoft.view.window.timing`. Raises
     OutputError if a display or a Vulkan driver is missing or the window does not open.
     """
 

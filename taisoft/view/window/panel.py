@@ -11,9 +11,10 @@ from collections.abc import Callable
 
 from taisoft.dynamics.schemes import CHOICES, SCHEMES, STATIC
 from taisoft.settings import contact_solvers
-from taisoft.view.colouring import TITLES, Colouring, following
-from taisoft.view.keys import KEYS
-from taisoft.view.scene_view import Layers
+from taisoft.view.choices import COLOURS
+from taisoft.view.colouring import Colouring, following
+from taisoft.view.layers import Layers
+from taisoft.view.window.keys import KEYS
 
 MAX_FRICTION = 1.5
 STRENGTHS = (0.3, 300.0)  # of the drag force over the body's weight, for a displacement as long as the body's diagonal
@@ -103,7 +104,7 @@ class Panel:
             force = values["drag"]
             text = "no body is dragged" if force is None else f"drag force {force[0]:.3g} N of at most {force[1]:.3g}"
             gui.text(text)
-        if gui.button(f"colour: {TITLES[self._colouring.kind]}###colour"):
+        if gui.button(f"colour: {COLOURS[self._colouring.kind].title}###colour"):
             self._colouring.choose_next()
         for text, colour in self._colouring.legend():
             gui.text(text, color=tuple(colour))

@@ -1,5 +1,5 @@
-"""Pilots, the errors that they show, and what steps cost, as arithmetic: a ladder gives the error and the order of its last
-pilot; one explicit pilot has an error by its velocities and by parts of it; pilots restore the state.
+"""Trials, the errors that they show, and what steps cost, as arithmetic: a refinement gives the error and the order of its last
+trial; one explicit trial has an error by its velocities and by parts of it; trials restore the state.
 """
 
 from dataclasses import replace
@@ -12,8 +12,8 @@ import taisoft as ts
 from taisoft.errors import SimulationError
 from taisoft.estimation.costs import explicit_step, implicit_step
 from taisoft.estimation.first_choice import settings_for, stable_steps
-from taisoft.estimation.ladder import Ladder
-from taisoft.estimation.pilots import FASTEST, HARDEST, Frames, Part, Pilot, distances, make_frames
+from taisoft.estimation.refinement import Refinement
+from taisoft.estimation.trials import FASTEST, HARDEST, Frames, Part, Trial, distances, make_frames
 from taisoft.records import RunReport
 from taisoft.running import RunRequest, run_steps
 from taisoft.settings import Settings
@@ -23,18 +23,20 @@ from tests.estimation.stand_in import BDF2, VERLET, block, motion
 FRAMES = Frames(1.0, 20.0, slice(None), np.zeros(1, dtype=int), 0.0)
 
 
-def pilot_of(integrator: str, steps, error: float, frames=range(21), **more) -> Pilot:
-    """A pilot that moves by 1 m in 20 s, too far by an error that grows with time."""
+def trial_of(integrator: str, steps, error: float, frames=range(21), **more) -> Trial:
+    """A trial that moves by 1 m in 20 s, too far by an error that grows with time."""
     positions = {k: np.array([[k / 20.0 * (1.0 + error), 0.0, 0.0]]) for k in frames}
-    return Pilot(integrator, Fraction(steps), positions, **more)
+    return Trial(integrator, Fraction(steps), positions, **more)
 
 
-def ladder_of(integrator: str, sudden: bool, sizes, impacts: bool = False, error: float = 0.001, order: float = 1.0) -> Ladder:
-    """A ladder of pilots, in the order in which they are added; error: of one step a frame."""
-    ladder = Ladder(integrator, sudden, 1 if sudden else 2, FRAMES, impacts)
+def refinement_of(
+    integrator: str, sudden: bool, sizes, impacts: bool = False, error: float = 0.001, order: float = 1.0
+) -> Refinement:
+    """A refinement of trials, in the order in which they are added; error: of one step a frame."""
+    refinement = Refinement(integrator, sudden, 1 if sudden else 2, FRAMES, impacts)
     for steps in sizes:
-        ladder.add(pilot_of(integrator, steps, error * float(Fraction(steps)) ** -order))
-    return ladder
+        refinement.add(trial_of(integrator, steps, error * float(Fraction(steps)) ** -order))
+    return refinement
 
 
 @pytest.mark.parametrize(
@@ -50,49 +52,49 @@ def ladder_of(integrator: str, sudden: bool, sizes, impacts: bool = False, error
 )
 def test_impacts_count_as_of_low_order(integrator, sudden, impacts, order, counted):
     """Where nothing but contacts lowers the order it may be 1.25; where it seems to be above 2 that is chance."""
-    ladder = ladder_of(integrator, sudden, (4, 8, 16), impacts, 1.0, order)
+    refinement = refinement_of(integrator, sudden, (4, 8, 16), impacts, 1.0, order)
     expected = (8**-order - 16**-order) / (2**counted - 1) / (1.0 + 16**-order)  # over the excursion
-    assert ladder.error == pytest.approx(expected) and ladder.order == pytest.approx(counted)
-    assert ladder.meets(1.1 * expected) == (sudden and counted <= 1.0) and ladder.meets(1.3 * expected)
+    assert refinement.error == pytest.approx(expected) and refinement.order == pytest.approx(counted)
+    assert refinement.meets(1.1 * expected) == (sudden and counted <= 1.0) and refinement.meets(1.3 * expected)
 
 
-def test_a_pilot_between_two_shows_the_order():
+def test_a_trial_between_two_shows_the_order():
     """Without it the error must be ten times below the tolerance. An explicit one is made up for where it may be the run."""
-    few, all_three = ladder_of(BDF2, True, ("1/4", 1)), ladder_of(BDF2, True, ("1/4", 1, "1/2"))
+    few, all_three = refinement_of(BDF2, True, ("1/4", 1)), refinement_of(BDF2, True, ("1/4", 1, "1/2"))
     assert few.error == pytest.approx(all_three.error, rel=0.01) and few.error == pytest.approx(0.001, rel=0.01)
     assert few.order is None and all_three.order == pytest.approx(1.0)
     assert [few.steps_needed(tolerance) for tolerance in (0.011, 0.009)] == [1, None]
     assert [all_three.steps_needed(tolerance) for tolerance in (0.009, 0.00051)] == [1, 3]
-    skipped = ladder_of(VERLET, True, (4, 16), impacts=True)
+    skipped = refinement_of(VERLET, True, (4, 16), impacts=True)
     least = 3.0 * skipped.error / (4.0**1.5 - 1.0) / 0.8  # by the likely order, with a safety of 0.8
     assert [skipped.next_steps(least / more**1.5, Fraction(16)) for more in (1.9, 2.5, 9.0)] == [8, 40, 64]
 
 
-def test_pilots_that_fail_stall_or_are_degraded():
-    ladder = ladder_of(VERLET, False, (4, 8, 16), order=2.0)
-    before = ladder.error
-    failed = pilot_of(VERLET, 32, 0.0, report=RunReport(status="failed"))
-    ladder.add(failed)
-    assert ladder.tried == 4 and len(ladder.pilots) == 3 and ladder.error == before and not ladder.is_over
-    while ladder.tried < 8:
-        ladder.add(failed)
-    assert ladder.is_over and not ladder.diverges
-    stalled = ladder_of(VERLET, False, (4, 8, 16, 32), order=-0.5)
-    assert stalled.diverges and stalled.is_over and not ladder_of(VERLET, False, (4, 8, 16), order=-0.5).diverges
-    assert not ladder_of(BDF2, False, ("1/4", "1/2", 1), order=-0.5).stalled  # so coarse that it does not count
-    for pilot in (degraded := ladder_of(VERLET, False, (4, 8, 16), order=2.0)).pilots:
-        pilot.report.status = "degraded"
+def test_trials_that_fail_stall_or_are_degraded():
+    refinement = refinement_of(VERLET, False, (4, 8, 16), order=2.0)
+    before = refinement.error
+    failed = trial_of(VERLET, 32, 0.0, report=RunReport(status="failed"))
+    refinement.add(failed)
+    assert refinement.tried == 4 and len(refinement.trials) == 3 and refinement.error == before and not refinement.is_over
+    while refinement.tried < 8:
+        refinement.add(failed)
+    assert refinement.is_over and not refinement.diverges
+    stalled = refinement_of(VERLET, False, (4, 8, 16, 32), order=-0.5)
+    assert stalled.diverges and stalled.is_over and not refinement_of(VERLET, False, (4, 8, 16), order=-0.5).diverges
+    assert not refinement_of(BDF2, False, ("1/4", "1/2", 1), order=-0.5).stalled  # so coarse that it does not count
+    for trial in (degraded := refinement_of(VERLET, False, (4, 8, 16), order=2.0)).trials:
+        trial.report.status = "degraded"
     assert [degraded.steps_needed(1.0) for _ in range(3)] == [None, None, 16]
 
 
 def test_velocities_show_an_error():
     """Smooth motion lags by the variation of its acceleration, with dt^2; an impact may be late by a step."""
 
-    def expected(sudden: bool, steps: int, variations: float, jump: float) -> Ladder:
-        ladder = Ladder(VERLET, sudden, 1 if sudden else 2, FRAMES)
-        ladder.add(pilot_of(VERLET, steps, 0.0, variations=np.array([0.0, variations]), jump=jump))
-        ladder.expect()
-        return ladder
+    def expected(sudden: bool, steps: int, variations: float, jump: float) -> Refinement:
+        refinement = Refinement(VERLET, sudden, 1 if sudden else 2, FRAMES)
+        refinement.add(trial_of(VERLET, steps, 0.0, variations=np.array([0.0, variations]), jump=jump))
+        refinement.expect()
+        return refinement
 
     smooth = expected(False, 4, 6.0, 0.0)
     assert 1.0 / 16 / 24 * 6.0 <= smooth.error < 0.1 and smooth.meets(1.3 * smooth.error)
@@ -113,47 +115,47 @@ def test_parts_with_a_slightly_smaller_step_show_an_error(sudden, nominal, order
 
     Without times also the fastest part of damped motion is run: its errors are of first order, those of the hardest of second.
     """
-    ladder = Ladder(VERLET, sudden, nominal, FRAMES)
+    refinement = Refinement(VERLET, sudden, nominal, FRAMES)
     parts = {HARDEST: Part(19, {}, 3.0), FASTEST: Part(18, {}, 4.0)}
-    ladder.add(pilot_of(VERLET, 4, 4.0**-order, variations=1e-9, parts=parts))
-    ladder.expect()
-    hardest, last = pilot_of(VERLET, 5, 5.0**-order, (19, 20)), 1.0 + 4.0**-order
+    refinement.add(trial_of(VERLET, 4, 4.0**-order, variations=1e-9, parts=parts))
+    refinement.expect()
+    hardest, last = trial_of(VERLET, 5, 5.0**-order, (19, 20)), 1.0 + 4.0**-order
     if times is not None:
-        ladder.confirm(hardest)
-        assert ladder.error * last == pytest.approx(times * 5.0**-order)
-        ladder.confirm(pilot_of(VERLET, 5, 0.0, (19, 20), report=RunReport(status="failed")))
-        assert ladder.error is None and not ladder.meets(1.0) and ladder.steps_over_last(0.01) == 1.0
+        refinement.confirm(hardest)
+        assert refinement.error * last == pytest.approx(times * 5.0**-order)
+        refinement.confirm(trial_of(VERLET, 5, 0.0, (19, 20), report=RunReport(status="failed")))
+        assert refinement.error is None and not refinement.meets(1.0) and refinement.steps_over_last(0.01) == 1.0
         return
     for fastest, shown in ((4.0**-2, 3.0 * 5.0**-2), (0.5, 4.0 * 19 / 20 * (0.5 - 4.0**-2) / 0.25)):
-        ladder.confirm(hardest, pilot_of(VERLET, 5, fastest, (18, 19)))
-        assert ladder.error * last == pytest.approx(shown)
+        refinement.confirm(hardest, trial_of(VERLET, 5, fastest, (18, 19)))
+        assert refinement.error * last == pytest.approx(shown)
 
 
 def test_the_hardest_part_is_that_of_an_impact():
-    """The block falls for 27 frames. The same steps repeat the part bitwise. Pilots leave the state as it was."""
+    """The block falls for 27 frames. The same steps repeat the part bitwise. Trials leave the state as it was."""
     sim = motion(frequency=0.0, floor=-1.5)(block(touching=True), 1e-3, VERLET)
     sim.advance(3)
     before = sim.snapshot()
     frames = make_frames(sim, 0.6, 1 / 60)
-    pilot = frames.pilot(sim, Fraction(17), None, keeps=(HARDEST, FASTEST))
-    hardest, fastest = pilot.parts[HARDEST], pilot.parts[FASTEST]
-    part = frames.pilot(sim, Fraction(17), None, part=hardest)
+    trial = frames.trial(sim, Fraction(17), None, keeps=(HARDEST, FASTEST))
+    hardest, fastest = trial.parts[HARDEST], trial.parts[FASTEST]
+    part = frames.trial(sim, Fraction(17), None, part=hardest)
     assert all(np.array_equal(before[name], sim.snapshot()[name]) for name in before if before[name] is not None)
     assert 27 <= hardest.first <= 31 and fastest.first >= 25 and hardest.times > 1.5 and fastest.times > 3.0
-    assert pilot.jump > 2.0
+    assert trial.jump > 2.0
     assert list(part.positions) == list(range(hardest.first, hardest.first + frames.part + 1))
-    assert all(np.array_equal(x, pilot.positions[frame]) for frame, x in part.positions.items())
-    assert pilot.end["step_count"] == 3 + 36 * 17 and pilot.touches and not part.counts_per_step()[0]
-    coarser = frames.pilot(sim, Fraction(1, 4), None)
+    assert all(np.array_equal(x, trial.positions[frame]) for frame, x in part.positions.items())
+    assert trial.end["step_count"] == 3 + 36 * 17 and trial.touches and not part.counts_per_step()[0]
+    coarser = frames.trial(sim, Fraction(1, 4), None)
     assert list(coarser.positions) == list(range(0, 37, 4)) and coarser.report.steps == 9
-    found, ends = distances(pilot, coarser), pilot.positions[36] - coarser.positions[36]
+    found, ends = distances(trial, coarser), trial.positions[36] - coarser.positions[36]
     assert found.shape == (10, 8) and np.allclose(found[-1], np.linalg.norm(ends, axis=1), rtol=1e-15)
-    pilot, seen, sim.dt = make_frames(sim, 0.6, 1 / 250).pilot(sim, Fraction(4), None), [], 1 / 1000
+    trial, seen, sim.dt = make_frames(sim, 0.6, 1 / 250).trial(sim, Fraction(4), None), [], 1 / 1000
     run_steps(sim, RunRequest(0.6, 250.0, on_frame=lambda sim, *_: seen.append(sim.v)))
-    assert list(pilot.positions) == [*range(0, 150, 4), 150]  # fewer than 48, and the last
+    assert list(trial.positions) == [*range(0, 150, 4), 150]  # fewer than 48, and the last
     changes = np.diff(seen, axis=0)
-    assert pilot.jump == pytest.approx(np.linalg.norm(changes, axis=2).max()) and len(seen) == 151
-    assert pilot.variations == pytest.approx(np.linalg.norm(np.diff(changes, axis=0), axis=2).sum(axis=0))
+    assert trial.jump == pytest.approx(np.linalg.norm(changes, axis=2).max()) and len(seen) == 151
+    assert trial.variations == pytest.approx(np.linalg.norm(np.diff(changes, axis=0), axis=2).sum(axis=0))
 
 
 def test_costs_add_up():

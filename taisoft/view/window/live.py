@@ -19,8 +19,8 @@ from functools import partial
 from taisoft.errors import SimulationError, TaisoftError
 from taisoft.records import StepReport
 from taisoft.running import timed_advance
-from taisoft.view.controls import Controls
-from taisoft.view.timing import Note
+from taisoft.view.window.controls import Controls
+from taisoft.view.window.timing import Note
 
 BATCH = 1.0 / 60.0  # longest wall time of a batch of explicit steps [s]
 ARREARS = 0.05  # of simulated time at unit speed that a simulation makes up [s]
