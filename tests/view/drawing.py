@@ -26,12 +26,6 @@ def body_mask(image):
     return rgb.max(axis=2) - rgb.min(axis=2) > 20
 
 
-def pixels(canvas) -> np.ndarray:
-    """The drawn picture of a canvas, uint8 (height, width, 3), first row on top."""
-    buffer = canvas.window.get_image_buffer_as_numpy()  # float32 (width, height, 4) in [0, 1], first row below
-    return (255 * buffer[:, :, :3] + 0.5).astype(np.uint8).transpose(1, 0, 2)[::-1]
-
-
 def sampled(sim, layers=(), *kinds):
     """The state of a simulation, which travelled as plain data."""
     sampler = Sampler(sim.scene)

@@ -20,7 +20,7 @@ from taisoft.view.scene_view import MARKER_COLOUR, Surfaces
 from taisoft.view.window.ggui import Canvas
 from taisoft.view.window.window import show
 from tests.dynamics.scenes import rubber
-from tests.view.drawing import SIZE, body_mask, needs_vulkan, pixels, sampled
+from tests.view.drawing import SIZE, body_mask, needs_vulkan, sampled
 from tests.view.fake_simulator import FakeSimulator, beam_scene
 
 LARGE = (640, 360)
@@ -261,7 +261,7 @@ def test_a_process_has_one_window_which_leaves_no_files(tmp_path, monkeypatch):
     surfaces = Surfaces(beam_scene())
     first = Canvas(surfaces, SIZE, visible=False)
     try:
-        pixels(first)
+        first.pixels(0, 0, *SIZE)
         with pytest.raises(OutputError, match="a window holds the only one a process can have"):
             Canvas(surfaces, SIZE, visible=False)
         with pytest.raises(SimulationError, match="a window is open"):
@@ -290,7 +290,7 @@ def test_the_window_blends_transparent_surfaces_from_far_to_near():
         try:
             for _ in range(2):  # the first picture of a window may be empty
                 canvas.draw(x, colours, FRONT, (1, 1, 1), lines)
-                shown = pixels(canvas).astype(int)
+                shown = canvas.pixels(0, 0, *SIZE).astype(int)
         finally:
             canvas.close()
         expected = drawing.image(state)
@@ -307,7 +307,7 @@ def test_lines_that_are_gone_are_not_drawn_any_more():
     try:
         for rows in (2, 4, 2):
             canvas.draw(np.zeros((n, 3)), np.zeros((n, 3)), camera, (1, 1, 1), (ends[:rows], red[:rows]))
-            pictures.append(pixels(canvas))
+            pictures.append(canvas.pixels(0, 0, *SIZE))
     finally:
         canvas.close()
     assert np.array_equal(pictures[0], pictures[2]) and not np.array_equal(pictures[0], pictures[1])

@@ -14,6 +14,7 @@ from taisoft.view.window.controls import Controls, touching_pairs
 from taisoft.view.window.panel import Panel, Requests, range_about
 from taisoft.view.window.screen import MESSAGES, PANEL, SIZE, Screen, free_part
 from taisoft.view.window.timing import Timing
+from tests.output.png import decode
 from tests.view.drawing import connected_scene, cubes_scene, sampled
 from tests.view.fake_simulator import FakeSimulator
 
@@ -228,12 +229,16 @@ class FakeCanvas(Gui):
     def draw(self, x, colours, camera, background, lines, shadows):
         self.drawn = camera
 
+    def pixels(self, left, top, right, bottom):
+        return np.full((bottom - top, right - left, 3), 90, np.uint8)
+
 
 @pytest.fixture
-def screen(cubes, monkeypatch):
+def screen(cubes, monkeypatch, tmp_path):
     """The window of the cubes, its canvas, and a function that draws with keys and buttons pressed and returns the commands."""
     canvas, requests, drawn = FakeCanvas(), Requests(), sampled(cubes)
     monkeypatch.setattr("taisoft.view.window.screen.Canvas", lambda *_, **__: canvas)
+    monkeypatch.chdir(tmp_path)
     shown = {"colour": "body", "layers": ("fixed_nodes",), "controls": True, "pairs": touching_pairs(cubes)}
     screen, state = Screen(drawn.scene, shown, requests), state_of(Controls(cubes)) | {"status": "", "messages": []}
 
@@ -245,7 +250,7 @@ def screen(cubes, monkeypatch):
     return screen, canvas, act
 
 
-def test_keys(screen, cubes):
+def test_keys(screen, tmp_path, cubes):
     screen, canvas, act = screen
     for key, action in {ti.ui.SPACE: "pause", "s": "step", ti.ui.RIGHT: "step", "r": "reset", ti.ui.UP: "faster"}.items():
         assert act([key]) == [[action]]
@@ -255,6 +260,10 @@ def test_keys(screen, cubes):
     assert {k for k in before if screen.layers.shown[k] != before[k]} == {"contacts", "fixed_nodes", "shadows", "wires"}
     act("v")
     assert screen.colouring.kind == "stress"
+    for keys in ("i", (), "i", ()):
+        act(keys)
+    assert decode((tmp_path / "out/window-1.png").read_bytes()).shape == (720, 1280, 3)
+    assert [path.name for path in sorted((tmp_path / "out").iterdir())] == ["window-1.png", "window-2.png"]
     screen.camera = replace(screen.camera, target=np.ones(3), azimuth=70.0)
     act("h")
     expected = Viewpoint.framing(cubes.positions(), SIZE, free_part(PANEL, SIZE), azimuth=70.0, elevation=screen.camera.elevation)

@@ -181,6 +181,13 @@ class Canvas:
             self._scene.scene.lines(self._ends.info, get_field_info(None), True, GREY, LINE_WIDTH, most, 0, most, 0)
         self._canvas.scene(self._scene)
 
+    def pixels(self, left: int, top: int, right: int, bottom: int) -> np.ndarray:
+        """Return a part of the drawn picture, uint8 (bottom - top, right - left, 3), first row on top."""
+        buffer = self.window.get_image_buffer_as_numpy()  # float32 (width, height, 4) in [0, 1], first row below
+        height = buffer.shape[1]
+        part = 255 * buffer[left:right, height - bottom : height - top, :3] + 0.5
+        return part.astype(np.uint8).transpose(1, 0, 2)[::-1]
+
     def close(self) -> None:
         """Destroy the window and release the runtime; a second call does nothing."""
         if self._runtime is None:

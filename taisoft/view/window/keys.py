@@ -34,6 +34,7 @@ KEYS = (
     Key(("t",), "T", "tractions", "tractions", "tractions"),
     Key(("f",), "F", "fixed_nodes", "fixed nodes", "fixed nodes"),
     Key(("d",), "D", "shadows", "shadows", "shadows on half-spaces"),
+    Key(("i",), "I", "screenshot", "picture", "write a picture, without the panel, to `out/window-1.png`"),
     Key((ti.ui.ESCAPE,), "Escape", "close", "end", "end"),
 )
 MOUSE = (

@@ -1,10 +1,16 @@
 """The live window on the screen: draws the latest state, and turns keys and mouse into actions and commands."""
 
+import itertools
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import taichi as ti
 
+from taisoft.errors import OutputError
+from taisoft.files import write_bytes
+from taisoft.output.files import make_folder
+from taisoft.output.frames import png_bytes
 from taisoft.output.viewpoint import MAX_WIDENING, Viewpoint
 from taisoft.view.colouring import BACKGROUND
 from taisoft.view.drawn import DrawnScene, DrawnState
@@ -26,6 +32,7 @@ ORBIT = 240.0  # angle for a drag over the whole window [deg]
 ZOOM = 16.0  # factor on the distance for a drag over the whole window
 DRAG_COLOUR = np.array([0.85, 0.10, 0.35])  # sRGB
 LONG = 1.0  # wall time of a step after which the panel says so [s]
+OUT = Path("out")
 FOR_SIMULATION = {"pause", "step", "reset", "faster", "slower", "unbound", "budget"}  # actions of the simulation
 
 
@@ -50,9 +57,11 @@ class Screen(SceneView):
         self._cursor: tuple[float, float] | None = None  # at the last picture
         self._mode = ""  # of the present mouse drag: "turn", "zoom", "shift", "drag", or "panel", which GGUI handles
         self._follows, self._centre = False, None  # whether the camera follows the bodies; their last centre
+        self._picture_size: tuple[int, int] | None = None  # of the last picture taken of the window
         self._close_requested = False
         self._drag: MouseDrag | None = None
-        self._note = Note()  # about the camera
+        self._screenshot = False  # requested
+        self._note = Note()  # about pictures and camera
         self._messages: list[str] = []  # those shown
         self._shadow_mesh = ShadowMesh(scene, self.surfaces)
         self._background = BACKGROUND if scene.background is None else scene.background
@@ -85,6 +94,7 @@ class Screen(SceneView):
             line_colours = np.concatenate([np.tile(DRAG_COLOUR, (2, 1)), line_colours])
         shadows = self._shadow_mesh.draw(x, drawn.poses, self.camera) if self.layers.shown["shadows"] else None
         self._canvas.draw(x, colours, self.camera, tuple(self._background[0]), (ends, line_colours), shadows)
+        self._take_picture(size)
         # lines above the sliders must be constant in number: a transient line would move the sliders under the cursor
         with window.get_gui().sub_window("taisoft", *self._panel_rectangle) as gui:
             for line in [state["status"], *state_lines(drawn), *self.timing.lines(state)]:
@@ -164,6 +174,7 @@ class Screen(SceneView):
         if "follow" in pressed:
             self._follows, self._centre, self._widest, self._has_own = not self._follows, None, 0.0, False
             self._note.set("the camera follows the bodies" if self._follows else "the camera stays")
+        self._screenshot |= "screenshot" in pressed
 
     def _read_mouse(self, drawn: DrawnState, size) -> None:
         window = self._canvas.window
@@ -202,6 +213,26 @@ class Screen(SceneView):
                 self._requests.add("drag", drag.target.tolist(), self._panel.strength, key="drag")
                 return "drag"
         return "turn"
+
+    # --- pictures -----------------------------------------------------------------------------------------------------
+
+    def _take_picture(self, size: tuple[int, int]) -> None:
+        """Write the drawn picture if that is requested, before the panel is declared, which would else be in it."""
+        # GGUI shows an empty window after a picture was taken of it at another size than the present one
+        if not self._screenshot and self._picture_size in (None, size):
+            return
+        picture = self._canvas.pixels(0, 0, *size)
+        self._picture_size = size
+        if not self._screenshot:
+            return
+        self._screenshot = False
+        path = next(one for n in itertools.count(1) if not (one := OUT / f"window-{n}.png").exists())
+        try:
+            make_folder(OUT)
+            write_bytes(path, png_bytes(picture))
+            self._note.set(f"written: {path}")
+        except OutputError as error:
+            self._note.set(str(error))
 
 
 def free_part(panel: tuple[float, float, float, float], size: tuple[int, int]) -> tuple[float, float, float, float]:
