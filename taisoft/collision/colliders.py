@@ -6,7 +6,7 @@ import numpy as np
 
 from taisoft.errors import MeshError, reworded
 from taisoft.fem.model import Layout
-from taisoft.mesh.sdf import SdfGrid, sdf_grid
+from taisoft.mesh.sdf import SdfGrid, cached_sdf_grid
 from taisoft.ranges import owners
 from taisoft.scene.body import Body
 from taisoft.scene.collision import principal_extents
@@ -85,7 +85,7 @@ def body_grid(body: Body, cells: int, margin: float) -> SdfGrid:
     """
     size = float(np.ptp(body.nodes.positions, axis=0).max())
     with reworded(MeshError, f"body {body.name!r}: its distance field cannot be made: "):
-        return sdf_grid(body.nodes.positions, body.nodes.surface, cells, margin=min(margin, 0.25 * size))
+        return cached_sdf_grid(body.nodes.positions, body.nodes.surface, cells, margin=min(margin, 0.25 * size))
 
 
 def collider_surfaces(scene: Scene, layout: Layout) -> tuple[Topology, np.ndarray]:

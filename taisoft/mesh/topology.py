@@ -14,6 +14,7 @@ from taisoft.errors import MeshError
 TET_FACES = np.array([(1, 2, 3), (0, 3, 2), (0, 1, 3), (0, 2, 1)])
 
 EDGES = ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))  # corners of a tet's six edges; edges k and 5-k are opposite
+GENERIC_DIRECTION = np.array([0.56071, 0.64493, 0.51922])  # distinct projections for grid vertices; length at most 1
 HALF_EDGES = np.array([(0, 1), (1, 2), (2, 0)])  # corners of a triangle's half-edges
 CRACK = 0.5  # the sides of a crack are less than this times their edges' length apart: wider ones are as well two rims
 
@@ -177,7 +178,7 @@ def merged_points(points: np.ndarray, tolerance: float) -> tuple[np.ndarray, np.
     # Merge equal points first: n of them in one place would make n^2 pairs.
     distinct, labels = np.unique(points + 0.0, axis=0, return_inverse=True)  # + 0.0 makes -0.0 equal to 0.0
     labels = labels.ravel()
-    if tolerance > 0:
+    if tolerance > 0 and _may_be_near(distinct, tolerance):
         pairs = scipy.spatial.cKDTree(distinct).query_pairs(tolerance, output_type="ndarray")
         labels = linked_groups(*pairs.T, len(distinct))[1][labels]
     first, inverse = np.unique(labels, return_index=True, return_inverse=True)[1:]
@@ -199,3 +200,13 @@ def crack_widths(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     other = scipy.spatial.cKDTree(across.reshape(-1, 6)).query(ends.reshape(-1, 6))[1]
     widths = np.linalg.norm(ends - across[other], axis=2).max(axis=1)
     return widths[widths < CRACK * np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)]
+
+
+def _may_be_near(points: np.ndarray, tolerance: float) -> bool:
+    """Return False if projections on GENERIC_DIRECTION show that no two points are at most `tolerance` apart, else True.
+
+    A cheap test that spares most meshes the k-d tree.
+    """
+    projections = np.sort(points @ GENERIC_DIRECTION)
+    rounding = 8.0 * np.finfo(np.float64).eps * float(np.abs(points).max(initial=0.0))
+    return bool((np.diff(projections) <= tolerance + rounding).any())

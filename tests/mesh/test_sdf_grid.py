@@ -1,11 +1,14 @@
-"""Signed distance grids: exact distances and signs, the size of the cells; surfaces without an inside are refused."""
+"""Signed distance grids: exact distances and signs at every point, the size of the cells; surfaces without an inside
+are refused; a cached grid is the same grid, and a damaged cache file is replaced.
+"""
 
 import numpy as np
 import pytest
 
 from taisoft.errors import MeshError
+from taisoft.mesh import sdf as module
 from taisoft.mesh.distances import distances, winding_numbers
-from taisoft.mesh.sdf import sdf_grid
+from taisoft.mesh.sdf import cache_folder, cached_sdf_grid, sdf_grid
 from taisoft.mesh.shapes import ball_mesh, box_mesh, sheet_mesh
 from taisoft.mesh.tet_mesh import TetMesh
 
@@ -117,3 +120,53 @@ def test_surfaces_without_an_inside_are_refused():
     with pytest.raises(MeshError, match=r"256 cells .* need 17779581 points \(261 x 261 x 261\); at most 2000000"):
         sdf_grid(mesh.vertices, mesh.surface, 256)
     assert sdf_grid(mesh.vertices, mesh.surface, 16, max_points=21**3).phi.size == 21**3
+
+
+@pytest.fixture
+def cache(tmp_path, monkeypatch):
+    """(mesh, the calls of `sdf_grid`) with an empty cache folder."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    calls = []
+
+    def counted(*args):
+        calls.append(args)
+        return sdf_grid(*args)
+
+    monkeypatch.setattr(module, "sdf_grid", counted)
+    return ball_mesh(1.0, 2), calls
+
+
+def cached_grid(mesh, cells=10, **options):
+    return cached_sdf_grid(mesh.vertices, mesh.surface, cells, **options)
+
+
+def equal(a, b) -> bool:
+    return all(np.array_equal(getattr(a, f), getattr(b, f)) for f in ("origin", "spacing", "phi"))
+
+
+def test_a_cached_grid_is_the_same_and_other_arguments_give_another_one(cache):
+    mesh, calls = cache
+    first, second = cached_grid(mesh), cached_grid(mesh)
+    assert len(calls) == 1 and equal(first, second) and not second.phi.flags.writeable
+    assert [path.suffix for path in cache_folder().iterdir()] == [".npz"]
+    cached_grid(mesh, cells=11)
+    cached_grid(mesh, margin=0.7)
+    cached_sdf_grid(mesh.vertices * 1.0000000001, mesh.surface, 10)
+    cached_sdf_grid(mesh.vertices, np.roll(mesh.surface, 1, axis=0), 10)
+    assert len(calls) == 5 == len(list(cache_folder().iterdir()))
+    with pytest.raises(MeshError, match="at most 100"):
+        cached_grid(mesh, max_points=100)
+
+
+def test_a_damaged_cache_file_is_replaced(cache):
+    mesh, calls = cache
+    first = cached_grid(mesh)
+    (path,) = cache_folder().iterdir()
+    whole, middle = path.read_bytes(), path.stat().st_size // 2
+    np.savez(path, origin=first.origin, spacing=first.spacing, phi=first.phi[1:])
+    for damaged in (path.read_bytes(), whole[:middle], whole[:middle] + bytes([whole[middle] ^ 1]) + whole[middle + 1 :]):
+        path.write_bytes(damaged)
+        calls.clear()
+        for _ in range(2):
+            assert equal(cached_grid(mesh), first) and len(calls) == 1
+    assert len(list(cache_folder().iterdir())) == 1
