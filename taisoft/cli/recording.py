@@ -22,7 +22,7 @@ from taisoft.output.usd import UsdWriter
 from taisoft.records import RunReport
 from taisoft.scene.fingerprint import digest
 from taisoft.view.annotations import text_missing
-from taisoft.view.choices import IN_WINDOW, LAYERS, NODAL, PLOTS
+from taisoft.view.choices import IN_WINDOW, LAYERS, PLOTS, nodal
 from taisoft.view.pictures import PictureOptions, open_pictures
 from taisoft.view.plots import Plots
 from taisoft.view.sampling import Sampler
@@ -61,7 +61,7 @@ def display_options(arguments: Namespace, has_window: bool) -> DisplayOptions:
     pictures = arguments.out is not None and not arguments.no_frames
     layers, plots = names_of("layers", arguments.layers, LAYERS), names_of("plots", arguments.plots, PLOTS) or ()
     details = names_of("details", arguments.details, (*DETAILS, QUANTITIES)) or ()
-    keep = names_of("keep", arguments.keep, NODAL)
+    keep = names_of("keep", arguments.keep, nodal())
     requested = {"video": arguments.video, "caption": arguments.caption, "plots": bool(plots)}
     requested |= {"size": arguments.size is not None, "view": arguments.view is not None}
     if not has_window:

@@ -35,7 +35,11 @@ COLOURS = {
     "slip": Colour("accumulated slip", "m", 1e-12, lambda values, sim: values.touching(sim, "accumulated_slip"), skips_zero=True),
     "error": Colour("estimated error", "m", 1e-12, lambda _, sim: sim.nodal_errors()),
 }
-NODAL = tuple(name for name in COLOURS if name != "body")  # those that states can keep
+
+
+def nodal() -> tuple[str, ...]:
+    """Return the names of the colours that have values at the nodes, which states can keep."""
+    return tuple(name for name, colour in COLOURS.items() if colour.value is not None)
 
 
 LAYERS = ("contacts", "tractions", "pressures", "connections", "fibres", "fixed_nodes", "wires")  # in this order they are drawn

@@ -20,7 +20,7 @@ from taisoft.errors import OutputError
 from taisoft.mesh.placing import UP
 from taisoft.output.viewpoint import Viewpoint
 from taisoft.scene.checks import choice
-from taisoft.view.choices import COLOURS, NODAL
+from taisoft.view.choices import COLOURS, nodal
 from taisoft.view.drawn import DrawnState
 
 QUANTILE = 0.99  # fraction of the nodes whose values lie within the scale
@@ -66,7 +66,7 @@ class Colouring:
 
     def fix(self, states: Iterable[DrawnState], end: float | None = None) -> None:
         """Keep one scale from now on, up to this end, or for the largest values in these states."""
-        if self.kind in NODAL:
+        if self.kind in nodal():
             largest = (self._largest(self._above(state)) for state in states if end is None)
             self.span, self._is_fixed = round_up(max(self._colour.least_span, *largest)) if end is None else end - self.low, True
 

@@ -8,7 +8,7 @@ from taisoft.errors import OutputError, SceneError, SimulationError, reworded
 from taisoft.output.connection_lines import ConnectionLines
 from taisoft.output.nodal_fields import NodalValues
 from taisoft.scene.loads import Cavity, value_at
-from taisoft.view.choices import ENERGIES, NODAL
+from taisoft.view.choices import ENERGIES, nodal
 from taisoft.view.drawn import DrawnScene, DrawnState, some, with_arrows
 
 MAX_SEGMENTS = 400  # of springs and tendons, in all
@@ -34,7 +34,7 @@ class Sampler:
         x, scene, time = sim.positions(), sim.scene, sim.time
         with np.errstate(over="ignore", invalid="ignore"):
             state = DrawnState(self.drawn, time, (x - self.drawn.start).astype(np.float32), sim.step_count)
-        state.values = {kind: self._values(kind, sim).astype(np.float32) for kind in kinds if kind in NODAL}
+        state.values = {kind: self._values(kind, sim).astype(np.float32) for kind in kinds if kind in nodal()}
         if energies:
             found = sim.energies()
             state.energies = {name: float(getattr(found, name)) for name in ENERGIES}

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import taichi as ti
 
-from taisoft.view.choices import NODAL
+from taisoft.view.choices import nodal
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ KEYS = (
     Key(("b",), "B", "budget", "budget", "end steps on a budget of wall time, or solve them"),
     Key(("h",), "H", "frame", "frame the bodies", "frame the bodies"),
     Key(("l",), "L", "follow", "follow them", "the camera follows the bodies, or stays"),
-    Key(("v",), "V", "colour", "colours", f"colour bodies by {', '.join(NODAL[:-2])}, {NODAL[-2]} or body"),
+    Key(("v",), "V", "colour", "colours", f"colour bodies by {', '.join(nodal()[:-2])}, {nodal()[-2]} or body"),
     Key(("w",), "W", "wires", "wires", "wires"),
     Key(("c",), "C", "contacts", "contacts", "contacts: normals green, impulses red"),
     Key(("t",), "T", "tractions", "tractions", "tractions"),
