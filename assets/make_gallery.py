@@ -17,7 +17,7 @@ import taisoft as ts
 from taisoft.cli import main as taisoft
 from taisoft.cli.scene_file import load_module
 from taisoft.files import write_bytes
-from taisoft.output.frames import SMALLEST, png_bytes
+from taisoft.output.picture_files import SMALLEST, png_bytes
 from taisoft.output.viewpoint import Viewpoint
 from taisoft.view.offscreen import Offscreen
 from taisoft.view.scene_view import IN_PICTURES

@@ -26,7 +26,7 @@ from pathlib import Path
 
 from taisoft.files import write_bytes
 from taisoft.machine import usable_cores
-from taisoft.output.files import make_folder
+from taisoft.output.folder import make_folder
 from taisoft.output.report import json_text
 from taisoft.processes import start_python
 

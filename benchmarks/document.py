@@ -17,7 +17,7 @@ from taisoft.errors import OutputError
 from taisoft.files import write_bytes
 from taisoft.machine import Timing, load_average, machine, summarise, versions
 from taisoft.output import tables
-from taisoft.output.files import make_folder
+from taisoft.output.folder import make_folder
 from taisoft.output.report import json_text
 from taisoft.output.tables import markdown, percent, spread_of
 

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from taisoft.machine import load_average
-from taisoft.output.files import make_folder
+from taisoft.output.folder import make_folder
 
 from .document import RESULTS, default_out, load_text, table
 from .runner import make_parser, progress

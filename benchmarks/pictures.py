@@ -20,7 +20,7 @@ from statistics import median
 
 import taisoft as ts
 from taisoft.cli.scene_file import load_scene
-from taisoft.output.frames import png_bytes
+from taisoft.output.picture_files import png_bytes
 from taisoft.view.offscreen import Offscreen
 from taisoft.view.pictures import PictureOptions, PictureProcess, picture_writer
 from taisoft.view.sampling import Sampler

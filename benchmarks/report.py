@@ -22,7 +22,7 @@ from taisoft.backend.runtime import compile_clock
 from taisoft.errors import OutputError
 from taisoft.files import write_bytes
 from taisoft.machine import load_average
-from taisoft.output.files import make_folder
+from taisoft.output.folder import make_folder
 from taisoft.output.report import json_text
 from taisoft.output.tables import require_matplotlib
 

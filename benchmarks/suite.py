@@ -21,7 +21,7 @@ from taisoft.machine import machine, usable_cores
 from taisoft.many.places import LocalPlace, carry_out
 from taisoft.many.store import Store, code_digest, digest
 from taisoft.nested import from_json, to_json
-from taisoft.output.files import FolderLock, make_folder
+from taisoft.output.folder import FolderLock, make_folder
 from taisoft.processes import serve
 
 from .document import Document, Limit

@@ -18,7 +18,7 @@ from train_hopper import STORED, program  # noqa: E402
 import taisoft as ts  # noqa: E402
 from taisoft.cli.scene_file import load_shipped  # noqa: E402
 from taisoft.files import write_bytes  # noqa: E402
-from taisoft.output.frames import SMALLEST, png_bytes  # noqa: E402
+from taisoft.output.picture_files import SMALLEST, png_bytes  # noqa: E402
 
 GROUND = ts.HalfSpace((0, 0, 0), (0, 1, 0))
 

@@ -14,7 +14,7 @@ from taisoft.dynamics.newton_budget import watched
 from taisoft.energy_check import EnergyCheck
 from taisoft.errors import SimulationError
 from taisoft.estimation.quantities import Definition, definitions, measure_at_end
-from taisoft.frames import ROUNDING, check_length, fit_dt
+from taisoft.frame_steps import ROUNDING, check_length, fit_dt
 from taisoft.records import RunReport, StepReport
 from taisoft.scene import checks
 

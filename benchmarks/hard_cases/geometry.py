@@ -5,7 +5,7 @@ import re
 import numpy as np
 
 import taisoft as ts
-from taisoft.cli.files import describe
+from taisoft.cli.meshes import describe
 
 from ..reference_cases.record import face, nearest
 from .case import (

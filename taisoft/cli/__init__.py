@@ -149,7 +149,7 @@ def command_parser() -> argparse.ArgumentParser:
         return command
 
     _add_run(add)
-    option = add("scene", ("files", "scene"), "write a scene, or a starting scene for a mesh, as a .toml file").add_argument
+    option = add("scene", ("meshes", "scene"), "write a scene, or a starting scene for a mesh, as a .toml file").add_argument
     _add_scene_name(option, "a .toml or .py file, or a mesh (.msh, .vtu, .vtk, .mesh, .node, USD) that falls on the ground")
     _add_placement(option, "instead of falling from above the ground")
     option("--order", type=int, choices=(1, 2), help="of the tets of a mesh, 1 or 2; 2 bends correctly (default 1)")
@@ -171,11 +171,11 @@ def command_parser() -> argparse.ArgumentParser:
     _add_study(add)
     add("list", ("scene_file", "list_demos"), "the demos, one line each")
 
-    option = add("info", ("files", "info"), "report a mesh file's counts, size, quality and problems").add_argument
+    option = add("info", ("meshes", "info"), "report a mesh file's counts, size, quality and problems").add_argument
     option("mesh", metavar="MESH", help="tetrahedra in any format that meshio reads, a surface, or a USD stage")
     option("--weld", type=float, metavar="D", help="first merge vertices at most this far apart, in the file's unit")
 
-    option = add("tetrahedralize", ("files", "fill"), "fill a surface with tets (extra 'mesh')").add_argument
+    option = add("tetrahedralize", ("meshes", "fill"), "fill a surface with tets (extra 'mesh')").add_argument
     option("surface", metavar="SURFACE", help="an .obj, .stl, .ply or .off file of triangles")
     _add_placement(option)
     option("--out", metavar="MESH", required=True, help="the mesh file: .msh, .vtk, .vtu or .mesh")

@@ -11,8 +11,8 @@ from taisoft.cli import EXIT_SIGNAL, Signals
 from taisoft.cli.pictures import camera_of, picture_options, slowness
 from taisoft.cli.recording import has_bar, make_video
 from taisoft.errors import OutputError, SceneError, reworded
-from taisoft.output.files import CHECKPOINT_NAME, DRAWN_NAME, OutputFolder
-from taisoft.output.frames import FRAMES_NAME, VIDEO_NAME
+from taisoft.output.folder import CHECKPOINT_NAME, DRAWN_NAME, OutputFolder
+from taisoft.output.picture_files import FRAMES_NAME, VIDEO_NAME
 from taisoft.output.report import frame_rate
 from taisoft.scene import checks
 from taisoft.scene.tables import Table

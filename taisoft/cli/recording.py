@@ -12,13 +12,13 @@ from taisoft.cli.pictures import names_of, picture_options, slowness
 from taisoft.details import DETAILS, QUANTITIES
 from taisoft.errors import OutputError, SceneError
 from taisoft.nested import to_json
-from taisoft.output.files import CHECKPOINT_NAME, RESULT_FILES, RESULT_FOLDERS, Observer, OutputFolder
-from taisoft.output.frame_files import VTU_NAME, VtuWriter, cut_pvd
+from taisoft.output.folder import CHECKPOINT_NAME, RESULT_FILES, RESULT_FOLDERS, Observer, OutputFolder
 from taisoft.output.frame_table import FrameTable
-from taisoft.output.frames import FRAMES_NAME, VIDEO_NAME, ffmpeg_command, find_ffmpeg, picture_numbers, write_video
 from taisoft.output.nodal_fields import NodalValues
+from taisoft.output.picture_files import FRAMES_NAME, VIDEO_NAME, ffmpeg_command, find_ffmpeg, picture_numbers, write_video
 from taisoft.output.report import body_records, write_report
 from taisoft.output.usd import UsdWriter
+from taisoft.output.vtu_files import VTU_NAME, VtuWriter, cut_pvd
 from taisoft.records import RunReport
 from taisoft.scene.fingerprint import digest
 from taisoft.view.annotations import text_missing

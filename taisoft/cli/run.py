@@ -24,8 +24,8 @@ from taisoft.cli.units import warn_millimetres
 from taisoft.dynamics.schemes import STATIC
 from taisoft.errors import SceneError, SimulationError, reworded
 from taisoft.estimation.quantities import definitions
-from taisoft.frames import check_length, first_frame
-from taisoft.output.files import check_free
+from taisoft.frame_steps import check_length, first_frame
+from taisoft.output.folder import check_free
 from taisoft.output.report import Progress
 from taisoft.records import RunReport
 from taisoft.scene import checks

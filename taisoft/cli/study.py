@@ -18,12 +18,12 @@ from taisoft.machine import machine, usable_cores
 from taisoft.many.cluster import cluster_places, connect
 from taisoft.many.places import LocalPlace
 from taisoft.many.store import Store, code_digest, digests, sources
-from taisoft.output.files import FolderLock, check_free, make_folder
+from taisoft.output.folder import FolderLock, check_free, make_folder
 from taisoft.processes import serve
 from taisoft.scene import checks
 from taisoft.scene.checks import check_solver
 from taisoft.study import AXES, Request, mesh_name
-from taisoft.study.output import FILES, check_scene, write
+from taisoft.study.pages import FILES, check_scene, write
 from taisoft.study.results import Study, text_of
 from taisoft.study.runner import CHILD, Runner
 
@@ -131,7 +131,7 @@ def answer(request: dict) -> dict:
     """Answer {"action": "plan" or "run", ...} in the child process: {"answer": plan or record} or {"error": sentence}."""
     from taisoft.scene.fingerprint import scene_digest
     from taisoft.study.measure import measure
-    from taisoft.study.plan import Planner
+    from taisoft.study.tasks import Planner
 
     scenes: dict[str, str] = {}  # digest of each variant that was loaded
     name, allow_outside = request["scene"], request["allow_outside"]

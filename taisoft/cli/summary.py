@@ -4,7 +4,7 @@ import textwrap
 
 from taisoft.cli.recording import Observers, Recording
 from taisoft.display import PROBLEMS_SHOWN, percent
-from taisoft.frames import dt_sentence
+from taisoft.frame_steps import dt_sentence
 from taisoft.records import ERROR_KINDS, ErrorEstimate, RunReport
 
 WIDTH = 118  # of the terminal

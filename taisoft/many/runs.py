@@ -24,7 +24,7 @@ from taisoft.many.make import COLUMNS, Make, make_of
 from taisoft.many.places import LocalPlace, Place, carry_out
 from taisoft.many.results import Results, Row
 from taisoft.many.store import Store, digest, digests
-from taisoft.output.files import FolderLock, check_free, make_folder
+from taisoft.output.folder import FolderLock, check_free, make_folder
 from taisoft.output.report import Bar, clock_text, json_text
 from taisoft.scene import checks
 

@@ -14,7 +14,7 @@ from taisoft import __version__
 from taisoft.files import write_bytes
 from taisoft.machine import versions
 from taisoft.nested import from_json, to_json
-from taisoft.output.files import make_folder
+from taisoft.output.folder import make_folder
 
 RUNS = "runs"
 KIND, FORMAT = "taisoft run", 2

@@ -7,7 +7,7 @@ from pathlib import Path
 from scipy.spatial.transform import Rotation
 
 from taisoft.files import write_bytes
-from taisoft.output.files import Observer
+from taisoft.output.folder import Observer
 from taisoft.output.tables import csv_text, read_table
 
 TABLE_NAME = "frames.csv"

@@ -18,7 +18,7 @@ import numpy as np
 from taisoft.errors import OutputError, reason
 from taisoft.files import write_bytes
 from taisoft.machine import PACKAGES, machine, peak_memory, versions
-from taisoft.output.files import Observer
+from taisoft.output.folder import Observer
 from taisoft.output.tables import csv_text, read_table
 from taisoft.records import RunReport, StepReport, headings
 

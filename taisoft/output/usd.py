@@ -27,7 +27,7 @@ from taisoft.dynamics.readout import nodal_impulses
 from taisoft.errors import OutputError
 from taisoft.files import replacing
 from taisoft.mesh.usd_content import usd_message
-from taisoft.output.files import Observer, make_folder, output_errors
+from taisoft.output.folder import Observer, make_folder, output_errors
 from taisoft.output.nodal_fields import UNKNOWN_ERROR, NodalValues
 from taisoft.output.usd_curves import TENSION
 from taisoft.output.usd_scene import OF_CAMERA, scene_layer

@@ -15,7 +15,7 @@ from contextlib import suppress
 import numpy as np
 
 from taisoft.errors import OutputError, TaisoftError, no_memory
-from taisoft.output.files import output_errors
+from taisoft.output.folder import output_errors
 from taisoft.processes import Child, Link, LinkClosed
 from taisoft.view.drawn import DrawnScene, DrawnState
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from taisoft.display import caption
 from taisoft.errors import OutputError
 from taisoft.files import write_bytes
-from taisoft.output.frames import FRAMES_NAME, png_bytes
+from taisoft.output.picture_files import FRAMES_NAME, png_bytes
 from taisoft.output.report import frame_rate
 from taisoft.scene.look import Camera
 from taisoft.view.colouring import checked_colour

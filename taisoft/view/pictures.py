@@ -11,8 +11,8 @@ from pathlib import Path
 
 from taisoft.errors import OutputError
 from taisoft.machine import usable_cores
-from taisoft.output.files import make_folder
-from taisoft.output.frames import FRAMES_NAME, FrameWriter
+from taisoft.output.folder import make_folder
+from taisoft.output.picture_files import FRAMES_NAME, FrameWriter
 from taisoft.view.annotations import Annotations
 from taisoft.view.choices import IN_PICTURES
 from taisoft.view.drawn import DrawnScene, DrawnState

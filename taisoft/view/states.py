@@ -17,7 +17,7 @@ from taisoft.errors import OutputError, TaisoftError, reason
 from taisoft.files import replacing
 from taisoft.nested import join_arrays, part_arrays
 from taisoft.output.background import BackgroundWriter
-from taisoft.output.files import Observer, make_folder
+from taisoft.output.folder import Observer, make_folder
 from taisoft.scene import checks
 from taisoft.scene.look import Camera, check_follow, colour_of, opacity_of
 from taisoft.scene.scene import Scene

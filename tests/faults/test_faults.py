@@ -24,7 +24,7 @@ from pxr import Sdf, Usd
 import taisoft as ts
 from taisoft import simulator
 from taisoft.checkpoint import read_checkpoint
-from taisoft.output.files import OutputFolder
+from taisoft.output.folder import OutputFolder
 from tests.backend.lanes import opened
 from tests.cli.command import BEAM, LED, ROOT, report, run, write
 from tests.output.png import decode

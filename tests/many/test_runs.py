@@ -22,7 +22,7 @@ from taisoft.machine import thread_count
 from taisoft.many import make, runs
 from taisoft.many.results import Results
 from taisoft.nested import from_json
-from taisoft.output.files import FolderLock
+from taisoft.output.folder import FolderLock
 from tests.many import makes
 from tests.many.stand_in import InProcess
 

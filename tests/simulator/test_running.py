@@ -10,7 +10,7 @@ import pytest
 import taisoft as ts
 from taisoft.dynamics.newton_budget import NewtonBudget
 from taisoft.dynamics.stage_system import StageSystem
-from taisoft.frames import dt_sentence, first_frame
+from taisoft.frame_steps import dt_sentence, first_frame
 from taisoft.records import Energies, StepReport
 from taisoft.running import run
 from tests.simulator.scenes import simulator

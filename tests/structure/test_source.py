@@ -62,7 +62,7 @@ ORDER = (
     ("view.layers",),
     ("view.scene_view", "view.shadow"),
     (
-        *("simulator", "queries", "contact_queries", "changes", "commanding", "energy_check", "frames", "running", "static"),
+        *("simulator", "queries", "contact_queries", "changes", "commanding", "energy_check", "frame_steps", "running", "static"),
         *("checkpoint", "estimation", "details"),
         *("output.vtu", "view.offscreen"),  # for methods of Simulator
     ),

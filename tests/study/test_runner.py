@@ -20,7 +20,7 @@ from taisoft.machine import versions
 from taisoft.many import store as stores
 from taisoft.many.store import Store
 from taisoft.study import Request, Setting
-from taisoft.study.output import check_scene, write
+from taisoft.study.pages import check_scene, write
 from taisoft.study.results import csv_of, text_of
 from taisoft.study.runner import Runner
 from tests.study.study_places import Pendulum

@@ -8,7 +8,7 @@ import pytest
 
 import taisoft as ts
 from taisoft.errors import SimulationError
-from taisoft.frames import fit_dt
+from taisoft.frame_steps import fit_dt
 from taisoft.records import RunReport, StepReport
 from taisoft.settings import Settings
 from taisoft.view.window.live import LiveRun

@@ -9,8 +9,8 @@ import taichi as ti
 
 from taisoft.errors import OutputError
 from taisoft.files import write_bytes
-from taisoft.output.files import make_folder
-from taisoft.output.frames import png_bytes
+from taisoft.output.folder import make_folder
+from taisoft.output.picture_files import png_bytes
 from taisoft.output.viewpoint import MAX_WIDENING, Viewpoint
 from taisoft.view.colouring import BACKGROUND
 from taisoft.view.drawn import DrawnScene, DrawnState

@@ -10,8 +10,8 @@ import time
 import warnings
 
 from taisoft.errors import OutputError
-from taisoft.frames import dt_sentence, fit_dt
-from taisoft.output.files import Observer
+from taisoft.frame_steps import dt_sentence, fit_dt
+from taisoft.output.folder import Observer
 from taisoft.records import RunReport, StepReport
 from taisoft.view.choices import IN_WINDOW
 from taisoft.view.link import Viewer

@@ -12,7 +12,7 @@ import numpy as np
 
 from taisoft.errors import OutputError
 from taisoft.files import write_bytes
-from taisoft.output.files import output_errors
+from taisoft.output.folder import output_errors
 from taisoft.output.report import json_text
 from taisoft.output.tables import require_matplotlib, save, ticks
 from taisoft.study.accuracy import Row

@@ -12,7 +12,7 @@ import pytest
 
 from taisoft.errors import OutputError
 from taisoft.files import replacing, write_bytes
-from taisoft.output.files import LOCK_NAME, OutputFolder
+from taisoft.output.folder import LOCK_NAME, OutputFolder
 
 
 def names(folder):

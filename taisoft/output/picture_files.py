@@ -16,7 +16,7 @@ import numpy as np
 from taisoft.errors import OutputError
 from taisoft.files import replacing, write_bytes
 from taisoft.output.background import BackgroundWriter
-from taisoft.output.files import make_folder
+from taisoft.output.folder import make_folder
 
 FRAMES_NAME, VIDEO_NAME = "frames", "video.mp4"
 COMPRESSION, SMALLEST = 2, 9  # zlib levels; 4 takes 1.7 times as long as 2 for a fifth fewer bytes, 9 several times as long

@@ -8,8 +8,8 @@ import pytest
 
 from taisoft.cli.recording import Recording
 from taisoft.errors import OutputError
-from taisoft.output import frames
-from taisoft.output.frames import VIDEO_NAME, FrameWriter, ffmpeg_command, find_ffmpeg, png_bytes, write_video
+from taisoft.output import picture_files
+from taisoft.output.picture_files import VIDEO_NAME, FrameWriter, ffmpeg_command, find_ffmpeg, png_bytes, write_video
 from tests.cli.command import run
 from tests.output.png import decode
 from tests.view.fake_simulator import FakeSimulator, beam_scene
@@ -40,7 +40,7 @@ class GreyRenderer:
 
 def writing(tmp_path, monkeypatch, write):
     """A writer whose files are written by `write(path, data)`."""
-    monkeypatch.setattr(frames, "write_bytes", write)
+    monkeypatch.setattr(picture_files, "write_bytes", write)
     return FrameWriter(tmp_path, GreyRenderer()), FakeSimulator(beam_scene())
 
 
@@ -120,8 +120,8 @@ def test_every_picture_is_a_frame(tmp_path):
 
 
 def test_command_is_printed_without_ffmpeg(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(frames, "find_spec", lambda name: None)
-    monkeypatch.setattr(frames.shutil, "which", lambda name: None)
+    monkeypatch.setattr(picture_files, "find_spec", lambda name: None)
+    monkeypatch.setattr(picture_files.shutil, "which", lambda name: None)
     out = tmp_path / "out"
     recording = Recording(str(out), overwrite=False)
     recording.video(30.0)

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from taisoft.errors import OutputError
 from taisoft.files import write_bytes
-from taisoft.output.files import PVD_NAME, Observer, make_folder
+from taisoft.output.folder import PVD_NAME, Observer, make_folder
 from taisoft.output.vtu import ENDING, Grid, vtk_file
 
 VTU_NAME = "vtu"  # folder

@@ -18,8 +18,8 @@ from taisoft.cli.study import values_of
 from taisoft.errors import SceneError
 from taisoft.scene.refine import refined, with_order
 from taisoft.study import AXES, Setting
-from taisoft.study.plan import Planner, complete, expand, frame_time
 from taisoft.study.runner import Task, steps_in, tasks_of
+from taisoft.study.tasks import Planner, complete, expand, frame_time
 from tests.cli.command import write
 from tests.fem.shells import inside, thick_sphere
 
