@@ -68,7 +68,7 @@ def _calls_with(kinds: tuple[str, ...]) -> dict[str, Call]:
 def call_methods(body: Body, table: Table) -> None:
     """Call the methods of a body with the tables in its lists. Raises SceneError."""
     for key, call in body_calls().items():
-        if key not in table.known:
+        if key not in table:
             continue
         first = () if call.method != "add_load" else (key,)
         name = f"add_{key}" if first else call.method
