@@ -1,4 +1,4 @@
-"""Results of a benchmark: a Markdown page of tables and limits, a JSON file, a comparison with an earlier run."""
+"""Results of a benchmark: a Markdown page of tables and limits, a JSON file, reading the numbers of an earlier run."""
 
 import argparse
 import json

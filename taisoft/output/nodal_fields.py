@@ -1,4 +1,4 @@
-"""Nodal fields for viewers, computed on the host from a simulator's tets and contacts: stress and contact loads.
+"""Nodal fields for viewers, computed on the host from a simulator: stress, stretch, speed and contact loads.
 
 The stress at node i is the mean over its tets e, weighted by their rest volumes V_e,
     sigma_i = sum_e V_e sigma_e / sum_e V_e,

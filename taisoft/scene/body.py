@@ -19,7 +19,7 @@ from taisoft.scene.collision import CONTACT_MODES
 from taisoft.scene.composition import Composition, compose
 from taisoft.scene.curves import Curve, check_shape, middle_nodes
 from taisoft.scene.key_frames import AT_REST, KeyFrames, NodePath
-from taisoft.scene.loads import LOADS, Activation, BodyLoad
+from taisoft.scene.loads import LOAD_KINDS, Activation, BodyLoad
 from taisoft.scene.look import colour_or_none, opacity_of
 from taisoft.scene.material import Material
 from taisoft.scene.skins import Skin, embed
@@ -34,8 +34,9 @@ _SHAPE = ("name", "mesh", "order", "curve", "quadrature_degree", "dilatation", "
 _DERIVED = ("rest_positions", "n_nodes", "is_curved", "volumes", "areas", "composition", "mass", "skin", "fibres")
 _READ_ONLY = (*_SHAPE, *_DERIVED, "activations")
 USE_A_COPY = "change a copy made by scene.snapshot() and make a new Simulator of it"
-BY_KIND = {"tractions": "traction", "forces": "force", "pressures": "pressure", "cavities": "cavity"}  # attributes -> of LOADS
-_SET = {kind: f"{load.set_by} for an existing one; otherwise {USE_A_COPY}" for kind, load in LOADS.items()}
+# attribute of a body -> kind of the loads that it lists
+KIND_OF = {"tractions": "traction", "forces": "force", "pressures": "pressure", "cavities": "cavity"}
+_SET = {kind: f"{load.set_by} for an existing one; otherwise {USE_A_COPY}" for kind, load in LOAD_KINDS.items()}
 
 
 @guarded_record("constraint", "add another one by body.fix or body.move")
@@ -58,9 +59,9 @@ def tet_number(name: str, doc: str) -> property:
 
 
 def loads_of(name: str) -> property:
-    """Return a property of a body for its loads of a kind. name: in BY_KIND."""
-    doc = f"Its loads of kind {BY_KIND[name]!r}, in the order added."
-    return property(lambda body: body._held(name, [one for one in body.loads if one.kind == BY_KIND[name]]), doc=doc)
+    """Return a property of a body for its loads of a kind. name: in KIND_OF."""
+    doc = f"Its loads of kind {KIND_OF[name]!r}, in the order added."
+    return property(lambda body: body._held(name, [one for one in body.loads if one.kind == KIND_OF[name]]), doc=doc)
 
 
 class Body(Guarded):
@@ -91,13 +92,13 @@ class Body(Guarded):
         "mass": "set body.density",
         "skin": "call body.embed",
         "activations": "call body.activate",
-        **{loads: f"call body.add_{kind} or body.remove" for loads, kind in BY_KIND.items()},
+        **{loads: f"call body.add_{kind} or body.remove" for loads, kind in KIND_OF.items()},
     }
     _contents = {
         "constraints": "call body.fix, body.move or body.remove",
         "loads": "call body.add_force, body.add_traction, body.add_pressure or body.remove",
     }
-    _takes: ClassVar = LOADS  # kinds of loads that may act on it
+    _takes: ClassVar = LOAD_KINDS  # kinds of loads that may act on it
     _takes_rule: ClassVar[str] = ""  # of others
     extent: ClassVar[str] = "the height of the nearest tet"  # the unit of `distance_outside`
     _default_frozen = USE_A_COPY
@@ -109,7 +110,7 @@ class Body(Guarded):
         "velocity": "call sim.set_state(velocities=..., body=...)",
         **dict.fromkeys(("add_load", "loads"), f"call sim.set_load(body, kind, index, value), or {USE_A_COPY}"),
         **{f"add_{kind}": rule for kind, rule in _SET.items()},
-        **{loads: _SET[kind] for loads, kind in BY_KIND.items()},
+        **{loads: _SET[kind] for loads, kind in KIND_OF.items()},
     }
 
     def __init__(
@@ -170,7 +171,7 @@ class Body(Guarded):
         """Stress-free node positions (n,3) [m], read-only; the mesh's vertices come first."""
         return self.nodes.positions
 
-    tractions, forces, pressures, cavities = map(loads_of, BY_KIND)
+    tractions, forces, pressures, cavities = map(loads_of, KIND_OF)
 
     @property
     def numbered_loads(self) -> list[tuple[str, int, BodyLoad]]:

@@ -9,7 +9,7 @@ from taisoft.errors import MeshError, SceneError, reworded
 from taisoft.mesh import quadratic
 from taisoft.scene import checks
 from taisoft.scene.key_frames import KeyFrames
-from taisoft.scene.loads import LOADS, Activation, BodyLoad, Cavity, NodalForce, Pressure, Traction, value_or_path
+from taisoft.scene.loads import LOAD_KINDS, Activation, BodyLoad, Cavity, NodalForce, Pressure, Traction, value_or_path
 
 if TYPE_CHECKING:
     from taisoft.scene.body import Body
@@ -20,10 +20,10 @@ def add_load(self: "Body", kind: str, where, *value, **arguments) -> BodyLoad:
 
     where, value, arguments: as `of` of its class takes them. Raises SceneError.
     """
-    what = self._check_open(f"add_{checks.choice(kind, f'{self._label()}: add_load: kind', tuple(LOADS))}")
+    what = self._check_open(f"add_{checks.choice(kind, f'{self._label()}: add_load: kind', tuple(LOAD_KINDS))}")
     if kind not in self._takes:
         raise SceneError(f"{self._label()}: {self._takes_rule}")
-    order, load = list(LOADS).index, LOADS[kind].of(self, what, where, *value, **arguments)
+    order, load = list(LOAD_KINDS).index, LOAD_KINDS[kind].of(self, what, where, *value, **arguments)
     self._hold("loads", sorted((*self.loads, load), key=lambda one: order(one.kind)))
     return load
 

@@ -20,7 +20,7 @@ from taisoft.scene.key_frames import KeyFrames
 if TYPE_CHECKING:
     from taisoft.scene.body import Body
 
-LOADS: dict[str, type["BodyLoad"]] = {}  # by kind; a body's loads are counted in this order
+LOAD_KINDS: dict[str, type["BodyLoad"]] = {}  # by kind; a body's loads are counted in this order
 DEAD, FOLLOWER = "loads", "pressure"  # features of a plan: loads that do not follow the motion, and those that do
 
 
@@ -97,8 +97,8 @@ def load_kind(kind: str, call: str = "") -> Callable[[type], type]:
         cls.kind, cls.set_by = kind, f"call {call_now}"
         if "given" not in cls.__annotations__:
             cls.given = kind
-        LOADS[kind] = guarded_record(kind, f"{cls.set_by} in a simulation")(cls)
-        return LOADS[kind]
+        LOAD_KINDS[kind] = guarded_record(kind, f"{cls.set_by} in a simulation")(cls)
+        return LOAD_KINDS[kind]
 
     return register
 

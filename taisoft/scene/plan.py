@@ -14,7 +14,7 @@ from taisoft.scene.body import NEARLY_INCOMPRESSIBLE, Body
 from taisoft.scene.collision import has_sharp_edges
 from taisoft.scene.connections import check_tendon
 from taisoft.scene.laws import LAWS
-from taisoft.scene.loads import DEAD, FOLLOWER, LOADS
+from taisoft.scene.loads import DEAD, FOLLOWER, LOAD_KINDS
 from taisoft.scene.material import FIBRE_NUMBERS
 from taisoft.scene.obstacles import Box, MeshObstacle
 from taisoft.scene.rigid import RigidBody
@@ -234,12 +234,12 @@ def change_material(body: Body, numbers: dict, on: dict[str, bool], region: int 
 
 
 def change_load(body: Body, kind: str, index: int, value) -> None:
-    """Set the value of a body's load `index` of a kind in LOADS, counted from 0 in the order added; it replaces a path.
+    """Set the value of a body's load `index` of a kind in LOAD_KINDS, counted from 0 in the order added; it replaces a path.
 
     value: (3,) [N], or (k,3) for the k nodes of a force; (3,) [Pa] for a traction; a number [Pa] for a pressure, or as
     given for a cavity. Raises SceneError.
     """
-    what = f"body {body.name!r}: set_{checks.choice(kind, f'body {body.name!r}: set_load: kind', tuple(LOADS))}"
+    what = f"body {body.name!r}: set_{checks.choice(kind, f'body {body.name!r}: set_load: kind', tuple(LOAD_KINDS))}"
     rows = [k for k, one in enumerate(body.loads) if one.kind == kind]
     if not rows:
         raise SceneError(f"{what}: it has no {kind}: give it one of 0 by body.add_{kind} before the Simulator is made")

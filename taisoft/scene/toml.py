@@ -13,6 +13,7 @@
     [[bodies.NAME.fix]]       nodes, axes                   [[bodies.NAME.move]]   nodes, path (KeyFrames), axes
     [[bodies.NAME.traction]]  triangles, traction [Pa]      [[bodies.NAME.force]]  nodes, force [N], or their KeyFrames
     [[bodies.NAME.pressure]]  triangles, pressure [Pa]      [[bodies.NAME.cavity]] triangles, pressure or volume, name
+    [[bodies.NAME.KIND]]      the arguments of another kind of load, see `taisoft.scene.loads`
     [[bodies.NAME.activate]]  activation, or its KeyFrames, region
     [bodies.NAME.skin]        surface (below), contact
     [rigid_bodies.NAME]       mesh (below, or a surface), and the arguments of Scene.add_rigid_body

@@ -14,7 +14,7 @@ from taisoft.scene import checks
 from taisoft.scene.body import Body
 from taisoft.scene.connection_records import Attachment, Point
 from taisoft.scene.key_frames import KeyFrames, NodePath
-from taisoft.scene.loads import LOADS, BodyLoad
+from taisoft.scene.loads import LOAD_KINDS, BodyLoad
 from taisoft.scene.obstacles import HalfSpace
 from taisoft.scene.rigid import RigidBody
 from taisoft.scene.scene import Scene
@@ -34,7 +34,7 @@ class Call:
 
     def arguments(self, owner: Body | Scene) -> tuple[list[str], list[str]]:
         """Return the keys of a table, and those that it must have."""
-        function = LOADS[self.key].of if self.method == "add_load" else getattr(owner, self.method)
+        function = LOAD_KINDS[self.key].of if self.method == "add_load" else getattr(owner, self.method)
         excluded = ("body", "what") if isinstance(owner, Body) else ("name",)
         known, required = arguments_of(function, *excluded)
         is_optional = isinstance(owner, RigidBody)  # nodes: without them its centre of mass
@@ -52,14 +52,14 @@ CONNECTIONS = {
 
 def body_calls() -> dict[str, Call]:
     """Return the calls of bodies by key, those of all kinds of loads included."""
-    return _calls_with(tuple(LOADS))
+    return _calls_with(tuple(LOAD_KINDS))
 
 
 @cache
 def _calls_with(kinds: tuple[str, ...]) -> dict[str, Call]:
     calls = [Call("fix", "fix"), Call("move", "move"), Call("activate", "activate", varying=("activation",))]
     for kind in kinds:
-        load = LOADS[kind]
+        load = LOAD_KINDS[kind]
         of_value, _ = arguments_of(load.of, "body", "what", "where", *load.own)
         calls.insert(-1, Call(kind, "add_load", load.items, tuple(of_value)))
     return {one.key: one for one in calls}

@@ -55,7 +55,7 @@ def _anonymous_file() -> int:
 
 
 class Viewer(Child):
-    """A process that shows or draws the states of a scene, and the memory shared with it.
+    """The caller's side of a process that shows or draws the states of a scene, and the memory shared with it.
 
     command: arguments of Python, to which the memory's descriptor is appended; scene, description: sent first; failure: what
     cannot be done without the process, for messages; slots: for the nodes' data. error: what ended it. Raises OutputError if it

@@ -70,7 +70,7 @@ def open_pictures(
 
 
 class PictureProcess(Viewer):
-    """Writes folder/frames/<index>.png of states in another process.
+    """The caller's side of the process that writes folder/frames/<index>.png of states.
 
     plots: history of options.plots; child: arguments of Python that start the process, if not CHILD. What fails in the other
     process, and its end, raises OutputError at the next `frame`, `flush` or `close`; later pictures are not written. Raises

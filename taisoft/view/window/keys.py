@@ -6,6 +6,8 @@ import taichi as ti
 
 from taisoft.view.choices import nodal
 
+CYCLED = [name for name in nodal() if name != "error"]  # the error needs a run that estimates it
+
 
 @dataclass(frozen=True)
 class Key:
@@ -28,7 +30,7 @@ KEYS = (
     Key(("b",), "B", "budget", "budget", "end steps on a budget of wall time, or solve them"),
     Key(("h",), "H", "frame", "frame the bodies", "frame the bodies"),
     Key(("l",), "L", "follow", "follow them", "the camera follows the bodies, or stays"),
-    Key(("v",), "V", "colour", "colours", f"colour bodies by {', '.join(nodal()[:-2])}, {nodal()[-2]} or body"),
+    Key(("v",), "V", "colour", "colours", f"colour bodies by {', '.join(CYCLED)} or body"),
     Key(("w",), "W", "wires", "wires", "wires"),
     Key(("c",), "C", "contacts", "contacts", "contacts: normals green, impulses red"),
     Key(("t",), "T", "tractions", "tractions", "tractions"),

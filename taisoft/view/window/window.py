@@ -27,7 +27,7 @@ CHILD = ("-P", "-m", "taisoft.view.window.window_process")
 
 
 class WindowProcess(Viewer):
-    """A window in a child process that shows a simulation.
+    """The caller's side of a window in a child process, which shows a simulation.
 
     sim: a Simulator; controls: whether the window changes it, or only shows it; colour, layers: those shown initially;
     child: arguments of Python that start the process, if not CHILD.
