@@ -205,6 +205,9 @@ class Cavity(BodyLoad, ScalarLoad):
             raise SceneError(f"{what}: volume must be above 0, not {float(start):g}")
 
 
+SHIPPED_LOADS = tuple(LOAD_KINDS)
+
+
 @guarded_record("activation", "call sim.set_activation(body, value) in a simulation")
 class Activation(ScalarLoad):
     """How active the fibres of a body are, or those of one of its regions: from 0 to 1."""

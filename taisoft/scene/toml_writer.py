@@ -22,6 +22,7 @@ from taisoft.scene.checks import SOLVER_CHECKS, check_solver
 from taisoft.scene.fibres import directions
 from taisoft.scene.key_frames import ShapePath
 from taisoft.scene.laws import SHIPPED
+from taisoft.scene.loads import SHIPPED_LOADS
 from taisoft.scene.material import MODULI, Material
 from taisoft.scene.obstacles import Obstacle
 from taisoft.scene.rigid import RigidBody
@@ -48,11 +49,10 @@ def write_scene(path, scene: Scene, solver: dict | None = None, overwrite: bool 
         raise SceneError(f"{file}: write_scene needs a Scene, not {type(scene).__name__}")
     if not scene.bodies:
         raise SceneError(f"{file}: the scene holds no body")
-    shipped = {law.name for law in SHIPPED}
-    for law in sorted({law for body in scene.bodies for law in body.composition.laws} - shipped):
-        warnings.warn(
-            f"{file}: register law {law!r} before ts.read_scene: the command line does not know it", UserWarning, stacklevel=2
-        )
+    own = {f"law {law!r}" for body in scene.bodies for law in body.composition.laws} - {f"law {law.name!r}" for law in SHIPPED}
+    own |= {f"load {one.kind!r}" for body in scene.bodies for one in body.loads if one.kind not in SHIPPED_LOADS}
+    for what in sorted(own):
+        warnings.warn(f"{file}: register {what} before ts.read_scene: the command line does not know it", stacklevel=2)
     meshes: dict[str, TetMesh] = {}
     text = toml_of(_document(scene, solver or {}, file.stem, meshes))
     try:
