@@ -1,17 +1,16 @@
 """Trials from coarse to fine, and the error of the finest: from its distance to the one before, by the observed order.
 
-The first explicit trial, which has the largest stable steps, is alone. What its velocities show, and its distance to a slightly
-smaller step in its hardest part, give the expected error. Impacts and releases make it unsure: unless it is far below the
-tolerance, a second trial takes slightly smaller steps all the way. It may still be wrong by a factor of ten.
+Each has twice as many steps as the one before, or four times as many where twice seems too few. Two explicit trials show an
+error by the nominal order; implicit ones may be too coarse for that, so that it takes three. Fewer must seem ten times better
+than needed.
 
-Where errors fall with dt at least, and twice as many steps seem too few, the second trial takes four times as many, and may be
-the run. Its distance to the first is almost the whole error of that one, and less by chance than one to a trial with half as many
-steps. It errs by a third of it; at an order of only 1/2 by three times as much, where half as many steps err by 2.4 times
-as much as shown. If it is not the run, the trial between them may show the order, or else a finer one does.
+Of the first explicit trial, which has the largest stable steps, velocities show an error. It may be the run alone: of sudden
+motion, too, if it seems ten times better than needed. Velocities of damped motion are themselves wrong, by an error of first
+order. Its fastest part, repeated with a slightly smaller step, shows it.
 
 After impacts of bodies without damping explicit steps show orders from 1.2 to 2. At most 1.25 counts, as an error from trials
-with h and 2 h is then too small by 1.4 at first order, and too large by 2.2 at second. Orders above 2, which the integrator does
-not have, are chance and count as 1. Any other sudden motion counts as of first order at most.
+with h and 2 h is then too small by 1.4 at first order, and too large by 2.2 at second. Orders above 2, which the integrator
+does not have, are chance and count as 1. Any other sudden motion counts as of first order at most.
 
 Velocity Verlet solves x'' = a + dt^2/12 x'''' up to dt^4 (Hairer, Lubich, Wanner, "Geometric Numerical Integration", 2006,
 IX.9). A motion of frequency w thus lags by the phase (w dt)^2/24 w t, which is dt^2/24 times the total variation of its
@@ -30,26 +29,24 @@ import numpy as np
 
 from taisoft.estimation.first_choice import EXPLICIT, IMPLICIT
 from taisoft.estimation.order import MIN_ORDER, difference_ratio, error_over_difference, observed_order
-from taisoft.estimation.trials import FASTEST, HARDEST, Frames, Trial, distances
+from taisoft.estimation.trials import Frames, Trial, distances
 
-SAFETY = 0.8  # part of the tolerance that an error may take, unless it is likely to be less
+SAFETY = 0.8  # part of the tolerance that an error may take
+UNSURE = 10.0  # a tolerance over the largest error that fewer trials, or one explicit one of sudden motion, may seem to have
 REACH = {EXPLICIT: 2, IMPLICIT: 8}  # steps of a run over those of the last trial, at most
 LEAST_REACH = 1.5  # the same, at least, where the run is not the last trial: a smaller ratio would amplify chance
 FEWEST = {EXPLICIT: 2, IMPLICIT: 3}  # trials that show an error: fewer coarse implicit steps may agree and be wrong
-SMALLER = Fraction(5, 4)  # steps of a slightly smaller size over those of the first explicit trial
-CHANCE = 0.5  # part of an expected error of sudden motion that may be chance
-SKIPPED = 4  # steps of the second explicit trial over those of the first where it skips one of twice as many
-MOST = 4.0  # steps of the second explicit trial over those of the first, at most
 LARGEST_STEP = 4  # frames in a step of the first implicit trial
 LEAST_STEPS = 8  # of an implicit trial
 MAX_TRIALS = 8
 MAX_DEGRADED = 2  # trials that meet the tolerance but are degraded, and are left for a finer one
 MAX_STALLED = 2  # trials in succession whose differences have not become smaller: the paths diverge
 COARSE = 2  # implicit trials with fewer steps a frame do not count as stalled
+SMALLER = Fraction(5, 4)  # steps of a slightly smaller size over those of the first explicit trial
+MOST, FAR = 4, 3.0  # steps of an explicit trial over those of the one before, at most; the ratio that is needed for that
 DISPERSION, IMPACT = 3.0, 1.25  # factors on the errors that velocities show
 SMOOTH_ORDER = 2.0  # of the integrators; that of sudden motion is this, or higher, only by chance
-IMPACT_ORDER, LIKELY_ORDER = 1.25, 1.5  # of explicit steps after impacts: highest that counts, and the one to plan with
-UNSURE = 8.0  # a tolerance over the largest error that fewer trials, or one explicit one of sudden motion, may seem to have
+IMPACT_ORDER = 1.25  # highest order that counts of explicit steps after impacts
 
 
 @dataclass
@@ -69,80 +66,54 @@ class Refinement:
     trials: list[Trial] = field(default_factory=list)
     error: float | None = None
     order: float | None = None
-    unsure: float = 1.0  # factor by which `error` must be below a tolerance
     stalled: int = 0  # see MAX_STALLED
     degraded: int = 0  # see MAX_DEGRADED
     tried: int = 0
     differences: list[float] = field(default_factory=list)
 
     def add(self, trial: Trial) -> None:
-        """Add a trial, and estimate the error of the one with the smallest steps. Those that fail are left out."""
+        """Add a trial, finer than all others, and estimate its error. Those that fail are left out."""
         self.tried += 1
         if trial.report.status == "failed":
             return
-        self.trials = sorted([*self.trials, trial], key=lambda one: one.per_frame)
-        for one in self.trials[:-1]:
-            one.end, one.parts = {}, {}  # it will not be the run
+        for one in self.trials:
+            one.end, one.fastest = {}, None  # it will not be the run
+        self.trials.append(trial)
         if len(self.trials) < 2:
+            explicit = self.integrator == EXPLICIT
+            self.error = self._over_excursion(trial, self._shown_by_velocities(trial)) if explicit else None
             return
-        before, last = self.trials[-2:]
+        before = self.trials[-2]
         pairs = itertools.pairwise(self.trials[-4:])
         self.differences = [float(np.sqrt(np.mean(distances(fine, coarse) ** 2))) for coarse, fine in pairs]
         self.order = self._observed_order()
-        self.unsure = UNSURE / SAFETY if self.are_few else self._measured
-        ratio = float(last.per_frame / before.per_frame)
-        self._set_error(last, float(distances(last, before).max()) * self.error_over_difference(ratio))
+        ratio = float(trial.per_frame / before.per_frame)
+        distance = float(distances(trial, before).max()) * self.error_over_difference(ratio)
+        self.error = self._over_excursion(trial, distance)
 
     @property
-    def _measured(self) -> float:
-        """`unsure` of a measured error: of sudden motion it is assumed to fall as slowly as it may, unless trials show more."""
-        return 1.0 if self.sudden and (self.order or 1.0) <= 1.0 else 1.0 / SAFETY
-
-    def expect(self) -> None:
-        """Expect the error of the only trial, explicit, from its velocities alone."""
-        trial, self.unsure = self.trials[0], (UNSURE if self.sudden else 1.0) / SAFETY
-        self._set_error(trial, self._expected_error(trial))
-
-    @property
-    def is_of_first_order(self) -> bool:
+    def is_damped(self) -> bool:
         """Whether motion is smooth, but of first order, as with damping: its velocities themselves are wrong."""
         return self.nominal == 1 and not self.sudden
 
-    def confirm(self, hardest: Trial, fastest: Trial | None = None) -> None:
-        """Expect the error of the only trial also from its hardest part, run with a slightly smaller step.
+    def confirm(self, part: Trial) -> None:
+        """Expect the error of the only trial, explicit and of damped motion, also from its fastest part with a smaller step.
 
-        Of smooth motion errors add up as changes of its velocities do, and of damped motion with time. fastest: the fastest part
-        of damped motion, run with that step too. It shows the errors of damping, of first order, which add up as velocities do;
-        those of changes are then of second order, as without damping.
+        Errors of damping are of first order, and add up as velocities do.
         """
         trial = self.trials[0]
-        if any(part is not None and part.report.status == "failed" for part in (hardest, fastest)):
+        if part.report.status == "failed":
             self.error = None
-        elif self.error:
-            if fastest is not None:
-                of_changes = self._shown(trial, hardest, 2) * trial.parts[HARDEST].times
-                shown = max(of_changes, self._shown(trial, fastest, 1) * trial.parts[FASTEST].times)
-            else:
-                times = 1.0 if self.sudden else trial.parts[HARDEST].times
-                times = self.frames.count / self.frames.part if self.is_of_first_order else times
-                shown = self._shown(trial, hardest, self.nominal) * times
-            self._set_error(trial, max(self._expected_error(trial), shown))
-
-    def replace_first(self, trial: Trial) -> None:
-        """Replace the first trial, explicit, by one with a slightly smaller step, and expect its error."""
-        self.tried += 1
-        if trial.report.status == "failed":
             return
-        before, self.trials, self.unsure = self.trials, [trial], self._measured
-        if before or not self.excursion(trial):
-            shown = self._shown(trial, before[0], self.nominal) if before else 0.0
-            self._set_error(trial, max(self._expected_error(trial), shown))
+        difference = float(distances(trial, part).max()) * error_over_difference(float(part.per_frame / trial.per_frame), 1.0)
+        self.error = max(self.error, self._over_excursion(trial, difference * trial.times))
 
-    @staticmethod
-    def _shown(trial: Trial, other: Trial, order: int) -> float:
-        """Error of a trial as its distance to another one shows it [m]."""
-        less, more = sorted((trial.per_frame, other.per_frame))
-        return float(distances(trial, other).max()) * error_over_difference(float(more / less), order)
+    def _shown_by_velocities(self, trial: Trial) -> float:
+        """Error of an explicit trial [m], see above."""
+        frame = self.frames.seconds
+        dt = frame / float(trial.per_frame)
+        error = dt * dt / 24.0 * (float(np.max(trial.variations)) + 2.0 * trial.jump) / frame
+        return max(error, IMPACT * dt * trial.jump) if self.sudden else DISPERSION * error
 
     @property
     def assumed_order(self) -> float:
@@ -161,10 +132,10 @@ class Refinement:
         found = trial.excursion
         return found if found > self.frames.negligible else 0.0
 
-    def _set_error(self, trial: Trial, distance: float) -> None:
-        """Set the error of a trial [m], over the excursion."""
+    def _over_excursion(self, trial: Trial, distance: float) -> float:
+        """An error of a trial [m], over the excursion."""
         excursion = self.excursion(trial)
-        self.error = distance / excursion if excursion else 0.0
+        return distance / excursion if excursion else 0.0
 
     def _observed_order(self) -> float | None:
         """Order of the last three trials; None if they show none."""
@@ -183,13 +154,6 @@ class Refinement:
         shows = self.impacts and self.integrator == EXPLICIT and order < SMOOTH_ORDER
         return min(order, IMPACT_ORDER if shows else 1.0)
 
-    def _expected_error(self, trial: Trial) -> float:
-        """Error of an explicit trial [m], from its velocities; see above."""
-        frame = self.frames.seconds
-        dt = frame / float(trial.per_frame)
-        error = dt * dt / 24.0 * (float(np.max(trial.variations)) + 2.0 * trial.jump) / frame
-        return max(error, IMPACT * dt * trial.jump) if self.sudden else DISPERSION * error
-
     @property
     def diverges(self) -> bool:
         """Whether the paths of different steps diverge."""
@@ -204,42 +168,31 @@ class Refinement:
         """Steps that a tolerance needs over those of the last trial, from its error, at the nominal order."""
         return 1.0 if self.error is None else (self.error / (SAFETY * tolerance)) ** (1.0 / self.nominal)
 
-    def second_steps(self, least: int, ratio: float) -> tuple[Fraction, bool]:
-        """Steps in the time of a frame of the second explicit trial, and whether it is nearly equal to the first and replaces it.
-
-        least: steps of the first; ratio: `steps_over_last` of it, from its velocities alone. Of sudden motion part of the error
-        may be chance, which the comparison of nearly equal steps amplifies.
-        """
-        more = slightly_more(least)
-        largest = float(more / least - 1) / CHANCE if self.sudden else float(SMALLER)
-        if ratio <= largest or not self.trials:
-            return more, True
-        if self.nominal == 1:
-            return Fraction(SKIPPED * least if ratio > 2.0 else 2 * least), False
-        return Fraction(math.ceil(least * min(MOST, max(LEAST_REACH, ratio)))), False
-
-    def next_steps(self, tolerance: float, finest: Fraction) -> Fraction:
-        """Steps in the time of a frame of the next explicit trial after the second. finest: the most that were tried.
-
-        If the second skipped a size, that one is made up for where it may show, by the likely order, that REACH is enough.
-        """
-        if len(self.trials) < 2 or self.trials[-1].per_frame < finest or self.nominal > 1:
-            return 2 * finest
-        ratio = float(finest / self.trials[-2].per_frame)
-        order = LIKELY_ORDER if self.impacts else 1.0
-        error = self.error / self.error_over_difference(ratio) * error_over_difference(ratio, order)
-        more = (error / (SAFETY * tolerance)) ** (1.0 / order)
-        if ratio == SKIPPED and self.tried == 2 and more <= REACH[EXPLICIT]:
-            return finest / 2
-        return Fraction(math.ceil(finest * min(MOST, more))) if self.impacts and more > 2.0 else 2 * finest
-
     def meets(self, tolerance: float) -> bool:
         """Whether the last trial is likely to meet a tolerance."""
-        return self.error is not None and self.error * self.unsure <= tolerance
+        return self.error is not None and self.error <= tolerance * self._allowed
+
+    @property
+    def _allowed(self) -> float:
+        """Part of a tolerance that the error may take.
+
+        A measured error of sudden motion is assumed to fall as slowly as it may, unless trials show more.
+        """
+        if self.are_few and (self.sudden or self.integrator == IMPLICIT):
+            return 1.0 / UNSURE
+        return SAFETY if self.are_few or not self.sudden or (self.order or 1.0) > 1.0 else 1.0
+
+    def next_steps(self, tolerance: float, finest: Fraction) -> Fraction:
+        """Steps in the time of a frame of the next explicit trial. finest: the most that were tried.
+
+        Trials that show an order, or fail, are followed by one with twice as many.
+        """
+        few = len(self.trials) == self.tried < 3
+        return finest * (MOST if few and self.steps_over_last(tolerance) > FAR else 2)
 
     def steps_needed(self, tolerance: float) -> int | None:
         """Steps of the run in the time of a frame, if the trials show how many; None if they do not yet."""
-        if not self.trials or self.error is None:
+        if self.error is None:
             return None
         last = self.trials[-1].per_frame
         if self.meets(tolerance):
@@ -263,28 +216,19 @@ class Refinement:
         return float(self.trials[-1].per_frame) * ratio
 
 
-def slightly_more(least: int) -> Fraction:
-    """Steps of a slightly smaller size, in the time of a frame."""
-    return Fraction(math.ceil(SMALLER * least))
-
-
 def implicit_sizes(count: int) -> Iterator[Fraction]:
-    """Steps in the time of a frame of implicit trials of a run of `count` frames, in the order in which they are run.
+    """Steps in the time of a frame of implicit trials of a run of `count` frames: fewer than one, then 1, 2, 4, ...
 
-    Runs have at least a step a frame. The second trial has one, since it may already be far better than it must be. Otherwise the
-    one between it and the first is made up for, to show the order.
+    Runs have at least a step a frame.
     """
     largest = LARGEST_STEP
     while largest > 1 and count < LEAST_STEPS * largest:
         largest //= 2
-    first = Fraction(1, largest)
-    while first * count < LEAST_STEPS:
-        first *= 2
-    yield first
-    finest = max(Fraction(1), 2 * first)
-    yield finest
-    if 4 * first == finest:
-        yield 2 * first
+    steps = Fraction(1, largest)
+    while steps * count < LEAST_STEPS:
+        steps *= 2
+    yield steps
+    steps = max(Fraction(1), 2 * steps)
     while True:
-        finest *= 2
-        yield finest
+        yield steps
+        steps *= 2

@@ -1,18 +1,16 @@
 """Runs to a tolerance: trials (`trials`) choose integrator and dt, and give the error of the run.
 
-Implicit trials are a series (`refinement`), each with half the step of the one before, that ends where the run needs at most
-eight times as many steps as the last trial. How many follows from the difference of the last two and its observed order. The
-second trial skips one, and is the run if it seems far better than it must be. Explicit steps cannot be coarser than stable. Their
-first trial has the largest stable step. Its velocities, and its hardest part repeated with a slightly smaller step, or also the
-fastest one, show whether it is enough; if that is not sure a second trial takes a smaller step all the way, and may skip one.
-Otherwise a refinement follows. A trial that meets the tolerance is the run, which is repeated only if frames or steps are
-observed, or an estimate by companions is asked for.
+Trials go from coarse to fine (`refinement`), until one meets the tolerance or they show how many steps the run needs: at most
+twice as many explicit ones, or eight times as many implicit ones. Explicit steps cannot be coarser than stable, with which
+they begin. A trial that meets the tolerance is the run, which is repeated only if frames or steps are observed, or an
+estimate by companions is asked for.
 
 Which kind of steps a run takes follows from counts (`costs`). Explicit steps are accepted at once where they cost less than
-implicit ones could, and an implicit trial ends when its steps cost more than explicit ones would. Among implicit methods BDF2 is
-used: it is of second order, has contacts, and damps what its steps cannot resolve.
+implicit ones could, and an implicit trial ends when its steps cost more than explicit ones would. Among implicit methods BDF2
+is used: it is of second order, has contacts, and damps what its steps cannot resolve.
 
-Weak: trials do not show what is faster than all of them (`vibrations`). Where their paths diverge, no step meets the tolerance.
+Weak: trials do not show what is faster than all of them (`vibrations`). Where their paths diverge, no step meets the
+tolerance.
 """
 
 import math
@@ -26,8 +24,8 @@ from taisoft.errors import SimulationError, collected_warnings
 from taisoft.estimation.costs import Spent, budget, explicit_step, implicit_step
 from taisoft.estimation.first_choice import EXPLICIT, IMPLICIT, stable_steps
 from taisoft.estimation.order import is_smooth, may_jump, nominal_order
-from taisoft.estimation.refinement import SMALLER, Refinement, implicit_sizes, slightly_more
-from taisoft.estimation.trials import FASTEST, HARDEST, Part, Recorder, Trial, distances, make_frames
+from taisoft.estimation.refinement import SMALLER, Refinement, implicit_sizes
+from taisoft.estimation.trials import Part, Recorder, Trial, distances, make_frames
 from taisoft.estimation.vibrations import ERROR as VIBRATIONS
 from taisoft.estimation.vibrations import add_vibrations, are_passed_over
 from taisoft.records import BodyError, ErrorEstimate, RunReport
@@ -39,7 +37,7 @@ if TYPE_CHECKING:
     from taisoft.simulator import Simulator
 
 DEARER = 4.0  # cost of explicit steps, over that of implicit ones that cannot meet the tolerance, at most
-TWO_TRIALS = float(1 + SMALLER)  # cost of explicit steps with their trials, over that of the first one, at least
+TWO_TRIALS = 2.25  # cost of explicit steps with their trials, over that of the first one, at least
 LEAST_FRAMES, MOST_FRAMES = 16, 64  # at which trials are compared where a run has few, or every step is one
 
 
@@ -149,9 +147,8 @@ class Chooser:
     def _by_implicit_trials(self, explicit: float) -> int | None:
         """Steps in the time of a frame; None if explicit ones, at a cost of `explicit` [us] a frame, are cheaper."""
         self._use(IMPLICIT, self._frames.seconds)
-        sim, refinement, sizes = self._sim, self.refinement, implicit_sizes(self._frames.count)
-        while True:
-            per_frame = next(sizes)
+        sim, refinement = self._sim, self.refinement
+        for per_frame in implicit_sizes(self._frames.count):
             steps = float(per_frame) * self._frames.count
             add_cost = budget(sim.scene, sim.touches, explicit / max(1.0, float(per_frame)), steps)
             try:
@@ -192,33 +189,14 @@ class Chooser:
     def _by_explicit_trials(self, least: int) -> int:
         """Explicit steps in the time of a frame."""
         self._use(EXPLICIT, self._dt(least))
-        refinement, ratio = self.refinement, 1.0
-        trial = self._trial(Fraction(least), keeps=(HARDEST, FASTEST) if refinement.is_of_first_order else (HARDEST,))
-        refinement.add(trial)
-        if refinement.trials:
-            refinement.expect()
-            ratio = refinement.steps_over_last(self._tolerance)
-            if refinement.meets(self._tolerance) and trial.report.status == "ok":
-                if self._is_confirmed(trial):
-                    return least
-        per_frame, replaces = refinement.second_steps(least, ratio)
-        (refinement.replace_first if replaces else refinement.add)(self._trial(per_frame))
-        while True:
-            steps = refinement.steps_needed(self._tolerance)
-            if steps is not None or refinement.is_over:
-                return steps or self._last_steps()
-            following = refinement.next_steps(self._tolerance, per_frame)
-            refinement.add(self._trial(following))
-            per_frame = max(per_frame, following)
-
-    def _is_confirmed(self, trial: Trial) -> bool:
-        """Whether parts of the first explicit trial, run with a slightly smaller step, show that it meets the tolerance."""
-        refinement, steps = self.refinement, slightly_more(int(trial.per_frame))
-        hardest = self._trial(steps, part=trial.parts[HARDEST])
-        refinement.confirm(hardest)
-        if refinement.is_of_first_order and refinement.error is not None and not refinement.meets(self._tolerance):
-            refinement.confirm(hardest, self._trial(steps, part=trial.parts[FASTEST]))
-        return refinement.meets(self._tolerance)
+        refinement, per_frame = self.refinement, Fraction(least)
+        refinement.add(self._trial(per_frame, keeps=refinement.is_damped))
+        if refinement.is_damped and refinement.meets(self._tolerance):
+            refinement.confirm(self._trial(Fraction(math.ceil(SMALLER * least)), part=refinement.trials[0].fastest))
+        while (steps := refinement.steps_needed(self._tolerance)) is None and not refinement.is_over:
+            per_frame = refinement.next_steps(self._tolerance, per_frame)
+            refinement.add(self._trial(per_frame))
+        return steps or self._last_steps()
 
     def _last_steps(self) -> int:
         """Steps of the last trial that did not fail. Raises SimulationError if all did."""
@@ -310,7 +288,7 @@ class Chooser:
             made.time = refinement.error
             if len(refinement.trials) == 1:
                 made.notes.append(
-                    "the error in time is expected from velocities and nearly equal steps, and may be wrong by a factor of ten"
+                    "the error in time is expected from velocities or nearly equal steps, and may be wrong by a factor of ten"
                 )
         else:
             made.order, ratio = refinement.order, float(run.per_frame / coarser[-1].per_frame)

@@ -1,14 +1,13 @@
 """Trials: runs of a whole simulation with trial steps, whose differences show which steps meet a tolerance.
 
 A trial takes steps of the run's own simulator, which afterwards is in the state that it had before. Trials are compared at
-common frames, at some of their nodes, so that their paths take little memory. A trial keeps the state before its hardest part,
-the one in which velocities change most from frame to frame, or also before its fastest one: other steps are compared with it
-there for a small part of the cost.
+common frames, at some of their nodes, so that their paths take little memory. A trial may keep the state before its fastest
+part: other steps are compared with it there for a small part of the cost.
 """
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from fractions import Fraction
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -28,18 +27,17 @@ if TYPE_CHECKING:
 NEGLIGIBLE = {"f32": 1e-6, "f64": 1e-12}  # excursions, over the size of the scene, that are rounding
 ROUNDING = 1e-6  # part of a frame that a run's length may lack of a whole one
 MAX_FRAMES = 48  # at which paths are recorded
-PARTS = 24  # of a run, about; a trial knows which is the hardest
+PARTS = 24  # of a run, about; a trial knows which is the fastest
 MAX_NODES = 4096  # whose paths are recorded, evenly spread
-HARDEST, FASTEST = "hardest", "fastest"  # parts: of the largest changes of velocities, and of the largest velocities
 
 
-@dataclass(frozen=True)
+@dataclass
 class Part:
-    """A part of a trial: its first frame, the state there, and the trial's sum of what distinguishes the part over that in it."""
+    """A part of a trial: its first frame, the state there, and the largest sum of a node's velocities in it."""
 
     first: int
     state: dict
-    times: float = 1.0
+    velocities: float = 0.0
 
 
 @dataclass
@@ -48,7 +46,8 @@ class Trial:
 
     positions: of the recorded nodes (n,3) [m], by the numbers of the recorded frames; variations: (n,) sums of the changes, from
     frame to frame, of what velocities change in a frame; jump: the largest such change of velocity [m/s]; end: the simulation's
-    state at the end; parts: the hardest one, or also the fastest one; warned: texts of warnings.
+    state at the end; fastest: the part of the largest velocities, if it is kept; velocities: those of all parts, added; warned:
+    texts of warnings.
     """
 
     integrator: str
@@ -58,7 +57,8 @@ class Trial:
     jump: float = 0.0
     report: RunReport = field(default_factory=RunReport)
     end: dict = field(default_factory=dict)
-    parts: dict[str, Part] = field(default_factory=dict)
+    fastest: Part | None = None
+    velocities: float = 0.0
     warned: list[str] = field(default_factory=list)
 
     def counts_per_step(self) -> list[float]:
@@ -72,6 +72,11 @@ class Trial:
         return any(report.n_contacts for report in self.report.step_reports)
 
     @property
+    def times(self) -> float:
+        """Velocities of all parts over those of the fastest one."""
+        return self.velocities / self.fastest.velocities if self.velocities else 1.0
+
+    @property
     def excursion(self) -> float:
         """The largest excursion [m]."""
         return largest_excursion(np.array(list(self.positions.values())))
@@ -80,19 +85,18 @@ class Trial:
 class Recorder:
     """Records a trial at its frames; pass `frame` to a run as on_frame.
 
-    stride: time between these, in frames of `frames`; first: the one at which it begins; keeps: parts before which to keep the
-    state.
+    stride: time between these, in frames of `frames`; first: the one at which it begins; keeps: whether to keep the state before
+    the fastest part.
     """
 
-    def __init__(self, trial: Trial, frames: "Frames", stride: Fraction, first: int = 0, keeps: tuple[str, ...] = ()):
+    def __init__(self, trial: Trial, frames: "Frames", stride: Fraction, first: int = 0, keeps: bool = False):
         self._trial, self._frames, self._first, self._keeps = trial, frames, first, keeps
         self._stride = stride if stride.denominator > 1 else int(stride)
         self._index: int | None = None  # of the first frame
         self._velocities: np.ndarray | None = None  # (n,3) at the frame before
         self._jump: np.ndarray | None = None  # (n,3) the change of velocities to that one
         self._part: Part | None = None  # the present one
-        self._sums: dict[str, np.ndarray | float] = dict.fromkeys(keeps, 0.0)  # (n,) in it, of what distinguishes parts
-        self._most, self._total = dict.fromkeys(keeps, -1.0), dict.fromkeys(keeps, 0.0)  # of the largest ones: in a part, in all
+        self._sums: np.ndarray | float = 0.0  # (n,) of velocities in it
 
     def frame(self, sim: "Simulator", index: int, _report) -> None:
         """Record a frame, unless it lies between those of `frames`, or is the last one and not whole."""
@@ -119,22 +123,19 @@ class Recorder:
             trial.jump = max(trial.jump, float(lengths.max()))
             changes = lengths if self._jump is None else _lengths(jump - self._jump)
             trial.variations = trial.variations + (0.0 if self._jump is None else changes)
-            for name in self._keeps:
-                self._sums[name] = self._sums[name] + (changes if name == HARDEST else _lengths(velocities))
+            self._sums = self._sums + _lengths(velocities)
             self._jump = jump
         self._velocities = velocities
 
     def _end_part(self, number: int, state: dict) -> None:
         """End a part of the run, and begin the next one at a frame, with the state there; at the end of the run it is empty."""
-        for name in self._keeps if self._part else ():
-            found = float(np.max(self._sums[name]))
-            self._total[name] += found
-            if found > self._most[name]:
-                self._most[name], self._trial.parts[name] = found, self._part
-            times = self._total[name] / self._most[name] if self._most[name] > 0.0 else 1.0
-            self._trial.parts[name] = replace(self._trial.parts[name], times=times)
-        self._part = Part(number, state) if state else None
-        self._sums = dict.fromkeys(self._keeps, 0.0)
+        trial, part = self._trial, self._part
+        if part is not None:
+            part.velocities = float(np.max(self._sums))
+            trial.velocities += part.velocities
+            if trial.fastest is None or part.velocities > trial.fastest.velocities:
+                trial.fastest = part
+        self._part, self._sums = Part(number, state), 0.0
 
 
 @dataclass(frozen=True)
@@ -176,13 +177,13 @@ class Frames:
         per_frame: Fraction,
         stop: Callable[[], bool] | None,
         part: Part | None = None,
-        keeps: tuple[str, ...] = (),
+        keeps: bool = False,
         on_step: StepCallback | None = None,
     ) -> Trial:
         """Run a trial of `per_frame` steps a frame; its report has the status "failed" if it fails. Restores sim's state.
 
-        part: of another trial, which alone is to be run; keeps: own parts before which to keep the state; stop, on_step: as for
-        `Simulator.run`.
+        part: of another trial, which alone is to be run; keeps: whether to keep the state before its fastest part; stop,
+        on_step: as for `Simulator.run`.
         """
         trial = Trial(sim.settings.integrator, per_frame)
         kept, may_soften = sim._dynamics.snapshot(), sim._may_soften

@@ -1,7 +1,8 @@
 """Trials, the errors that they show, and what steps cost, as arithmetic: a refinement gives the error and the order of its last
-trial; one explicit trial has an error by its velocities and by parts of it; trials restore the state.
+trial; one explicit trial has an error by its velocities and by its fastest part; trials restore the state.
 """
 
+import itertools
 from dataclasses import replace
 from fractions import Fraction
 
@@ -12,8 +13,8 @@ import taisoft as ts
 from taisoft.errors import SimulationError
 from taisoft.estimation.costs import explicit_step, implicit_step
 from taisoft.estimation.first_choice import settings_for, stable_steps
-from taisoft.estimation.refinement import Refinement
-from taisoft.estimation.trials import FASTEST, HARDEST, Frames, Part, Trial, distances, make_frames
+from taisoft.estimation.refinement import Refinement, implicit_sizes
+from taisoft.estimation.trials import Frames, Part, Trial, distances, make_frames
 from taisoft.records import RunReport
 from taisoft.running import RunRequest, run_steps
 from taisoft.settings import Settings
@@ -32,7 +33,7 @@ def trial_of(integrator: str, steps, error: float, frames=range(21), **more) -> 
 def refinement_of(
     integrator: str, sudden: bool, sizes, impacts: bool = False, error: float = 0.001, order: float = 1.0
 ) -> Refinement:
-    """A refinement of trials, in the order in which they are added; error: of one step a frame."""
+    """A refinement of trials, from coarse to fine; error: of one step a frame."""
     refinement = Refinement(integrator, sudden, 1 if sudden else 2, FRAMES, impacts)
     for steps in sizes:
         refinement.add(trial_of(integrator, steps, error * float(Fraction(steps)) ** -order))
@@ -58,16 +59,24 @@ def test_impacts_count_as_of_low_order(integrator, sudden, impacts, order, count
     assert refinement.meets(1.1 * expected) == (sudden and counted <= 1.0) and refinement.meets(1.3 * expected)
 
 
-def test_a_trial_between_two_shows_the_order():
-    """Without it the error must be ten times below the tolerance. An explicit one is made up for where it may be the run."""
-    few, all_three = refinement_of(BDF2, True, ("1/4", 1)), refinement_of(BDF2, True, ("1/4", 1, "1/2"))
-    assert few.error == pytest.approx(all_three.error, rel=0.01) and few.error == pytest.approx(0.001, rel=0.01)
+def test_too_few_trials_must_seem_far_better_than_needed():
+    """By a factor of ten; a third implicit trial shows the order, whatever the ratios of steps."""
+    few, all_three = refinement_of(BDF2, True, ("1/4", 1)), refinement_of(BDF2, True, ("1/4", 1, 2))
+    assert few.error == pytest.approx(0.001, rel=0.01) and all_three.error == pytest.approx(0.0005, rel=0.01)
     assert few.order is None and all_three.order == pytest.approx(1.0)
     assert [few.steps_needed(tolerance) for tolerance in (0.011, 0.009)] == [1, None]
-    assert [all_three.steps_needed(tolerance) for tolerance in (0.009, 0.00051)] == [1, 3]
-    skipped = refinement_of(VERLET, True, (4, 16), impacts=True)
-    least = 3.0 * skipped.error / (4.0**1.5 - 1.0) / 0.8  # by the likely order, with a safety of 0.8
-    assert [skipped.next_steps(least / more**1.5, Fraction(16)) for more in (1.9, 2.5, 9.0)] == [8, 40, 64]
+    assert [all_three.steps_needed(tolerance) for tolerance in (0.0051, 0.00026)] == [2, 5]
+
+
+def test_trials_have_two_or_four_times_the_steps():
+    """Four where three times as many seem too few, until an order shows or a trial fails."""
+    first = refinement_of(VERLET, True, (4, 8), impacts=True)
+    assert [first.next_steps(0.8 * first.error / more * 1.5625, Fraction(8)) for more in (2.9, 5.1)] == [16, 32]
+    assert refinement_of(VERLET, True, (4, 8, 16)).next_steps(1e-9, Fraction(16)) == 32
+    first.add(trial_of(VERLET, 32, 0.0, report=RunReport(status="failed")))
+    assert first.next_steps(1e-9, Fraction(32)) == 64
+    for count, expected in ((100, ["1/4", 1, 2, 4]), (20, ["1/2", 1, 2, 4]), (3, [4, 8, 16, 32])):
+        assert list(itertools.islice(implicit_sizes(count), 4)) == [Fraction(steps) for steps in expected]
 
 
 def test_trials_that_fail_stall_or_are_degraded():
@@ -93,7 +102,6 @@ def test_velocities_show_an_error():
     def expected(sudden: bool, steps: int, variations: float, jump: float) -> Refinement:
         refinement = Refinement(VERLET, sudden, 1 if sudden else 2, FRAMES)
         refinement.add(trial_of(VERLET, steps, 0.0, variations=np.array([0.0, variations]), jump=jump))
-        refinement.expect()
         return refinement
 
     smooth = expected(False, 4, 6.0, 0.0)
@@ -107,43 +115,32 @@ def test_velocities_show_an_error():
     assert not late.meets(5.0 * late.error) and late.meets(12.0 * late.error)  # it is unsure
 
 
-@pytest.mark.parametrize(
-    "sudden, nominal, order, times", [(True, 1, 1, 1.0), (False, 2, 2, 3.0), (False, 1, 1, 20.0), (False, 1, 2, None)]
-)
-def test_parts_with_a_slightly_smaller_step_show_an_error(sudden, nominal, order, times):
-    """At the end of the hardest part the paths with 4 and 5 steps differ by their errors; times: as often as that adds up.
-
-    Without times also the fastest part of damped motion is run: its errors are of first order, those of the hardest of second.
-    """
-    refinement = Refinement(VERLET, sudden, nominal, FRAMES)
-    parts = {HARDEST: Part(19, {}, 3.0), FASTEST: Part(18, {}, 4.0)}
-    refinement.add(trial_of(VERLET, 4, 4.0**-order, variations=1e-9, parts=parts))
-    refinement.expect()
-    hardest, last = trial_of(VERLET, 5, 5.0**-order, (19, 20)), 1.0 + 4.0**-order
-    if times is not None:
-        refinement.confirm(hardest)
-        assert refinement.error * last == pytest.approx(times * 5.0**-order)
-        refinement.confirm(trial_of(VERLET, 5, 0.0, (19, 20), report=RunReport(status="failed")))
-        assert refinement.error is None and not refinement.meets(1.0) and refinement.steps_over_last(0.01) == 1.0
-        return
-    for fastest, shown in ((4.0**-2, 3.0 * 5.0**-2), (0.5, 4.0 * 19 / 20 * (0.5 - 4.0**-2) / 0.25)):
-        refinement.confirm(hardest, trial_of(VERLET, 5, fastest, (18, 19)))
-        assert refinement.error * last == pytest.approx(shown)
+def test_the_fastest_part_shows_errors_of_damping():
+    """At its end the paths with 4 and 5 steps differ by their errors, which add up as velocities do; a part may fail."""
+    refinement = Refinement(VERLET, False, 1, FRAMES)
+    refinement.add(trial_of(VERLET, 4, 1 / 4, variations=1e-9, fastest=Part(19, {}, 2.0), velocities=6.0))
+    assert refinement.is_damped and refinement.meets(1e-6)
+    refinement.confirm(trial_of(VERLET, 5, 1 / 5, (19, 20)))
+    assert refinement.error * (1 + 1 / 4) == pytest.approx(3.0 / 5)
+    refinement.confirm(trial_of(VERLET, 5, 1 / 4, (19, 20)))
+    assert refinement.error * (1 + 1 / 4) == pytest.approx(3.0 / 5)  # the larger of all
+    refinement.confirm(trial_of(VERLET, 5, 0.0, (19, 20), report=RunReport(status="failed")))
+    assert refinement.error is None and not refinement.meets(1.0) and refinement.steps_over_last(0.01) == 1.0
 
 
-def test_the_hardest_part_is_that_of_an_impact():
+def test_the_fastest_part_is_kept():
     """The block falls for 27 frames. The same steps repeat the part bitwise. Trials leave the state as it was."""
     sim = motion(frequency=0.0, floor=-1.5)(block(touching=True), 1e-3, VERLET)
     sim.advance(3)
     before = sim.snapshot()
     frames = make_frames(sim, 0.6, 1 / 60)
-    trial = frames.trial(sim, Fraction(17), None, keeps=(HARDEST, FASTEST))
-    hardest, fastest = trial.parts[HARDEST], trial.parts[FASTEST]
-    part = frames.trial(sim, Fraction(17), None, part=hardest)
+    trial = frames.trial(sim, Fraction(17), None, keeps=True)
+    fastest = trial.fastest
+    part = frames.trial(sim, Fraction(17), None, part=fastest)
     assert all(np.array_equal(before[name], sim.snapshot()[name]) for name in before if before[name] is not None)
-    assert 27 <= hardest.first <= 31 and fastest.first >= 25 and hardest.times > 1.5 and fastest.times > 3.0
+    assert fastest.first >= 25 and trial.times > 3.0 and part.fastest is None
     assert trial.jump > 2.0
-    assert list(part.positions) == list(range(hardest.first, hardest.first + frames.part + 1))
+    assert list(part.positions) == list(range(fastest.first, fastest.first + frames.part + 1))
     assert all(np.array_equal(x, trial.positions[frame]) for frame, x in part.positions.items())
     assert trial.end["step_count"] == 3 + 36 * 17 and trial.touches and not part.counts_per_step()[0]
     coarser = frames.trial(sim, Fraction(1, 4), None)

@@ -52,14 +52,14 @@ def test_runs_and_frames_of_any_length(make, seconds, fps):
 @pytest.mark.parametrize(
     "make, kind, tolerance, trials, per_frame",
     [
-        (soft, ELASTIC, 0.1, "1 part2", 1),  # one trial, whose hardest part is run again with a slightly smaller step
+        (soft, ELASTIC, 0.1, "1", 1),  # its velocities show its error
         (soft, ELASTIC, 0.001, "1 4", 6),
-        (soft, CREEPING, 0.02, "1 part2 part2", 1),  # its fastest part too
+        (soft, CREEPING, 0.02, "1 part2", 1),  # its fastest part, run again with a slightly smaller step, too
         (soft, IMPACT, 0.01, "1 4", 4),
-        (soft, IMPACT, 0.001, "1 4 2 11", 11),  # the size that was skipped shows the order
-        (stiff, SLOW, 0.001, "1/4 implicit 1 implicit 1/2 implicit", 2),
-        (stiff, SLOW, 0.0001, "1/4 implicit 1 implicit 1/2 implicit 128 part160", 128),  # explicit steps are cheaper
-        (stiff, motion(frequency=3.0, newton=50), 0.01, "1/4 implicit 128 part160", 128),
+        (soft, IMPACT, 0.001, "1 4 16", 16),
+        (stiff, SLOW, 0.001, "1/4 implicit 1 implicit 2 implicit", 2),
+        (stiff, SLOW, 0.0001, "1/4 implicit 1 implicit 2 implicit 128", 128),  # explicit steps are cheaper
+        (stiff, motion(frequency=3.0, newton=50), 0.01, "1/4 implicit 128", 128),
     ],
 )
 def test_which_trials_choose_the_steps(make, kind, tolerance, trials, per_frame, monkeypatch):
@@ -111,7 +111,7 @@ def test_errors_above_the_tolerance_or_unknown_degrade_a_run():
     result = run(soft(), 0.3, on_frame=lambda sim, k, _: setattr(sim, "changes", 1) if k == 5 else None)
     assert result.error_estimate.time is None and "changed during the run" in result.error_estimate.notes[0]
     assert result.problems[-1] == "the error in time is unknown, and the tolerance is 1 %" and result.status == "degraded"
-    kind = motion(frequency=3.0, offset=lambda sim: (42.0 * sim.settings.newton_tolerance * sim.time, 0.0, 0.0))
+    kind = motion(frequency=3.0, offset=lambda sim: (44.0 * sim.settings.newton_tolerance * sim.time, 0.0, 0.0))
     result = run(stiff(0.01, kind, newton_tolerance=5e-4), 0.6, error=True)
     e = result.error_estimate
     assert max(e.time, e.solver) < 0.01 < e.total and result.status == "degraded"
