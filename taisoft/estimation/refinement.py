@@ -33,7 +33,7 @@ from taisoft.estimation.trials import Frames, Trial, distances
 
 SAFETY = 0.8  # part of the tolerance that an error may take
 UNSURE = 10.0  # a tolerance over the largest error that fewer trials, or one explicit one of sudden motion, may seem to have
-REACH = {EXPLICIT: 2, IMPLICIT: 8}  # steps of a run over those of the last trial, at most
+REACH = {EXPLICIT: 3, IMPLICIT: 8}  # steps of a run over those of the last trial, at most
 LEAST_REACH = 1.5  # the same, at least, where the run is not the last trial: a smaller ratio would amplify chance
 FEWEST = {EXPLICIT: 2, IMPLICIT: 3}  # trials that show an error: fewer coarse implicit steps may agree and be wrong
 LARGEST_STEP = 4  # frames in a step of the first implicit trial
@@ -43,7 +43,7 @@ MAX_DEGRADED = 2  # trials that meet the tolerance but are degraded, and are lef
 MAX_STALLED = 2  # trials in succession whose differences have not become smaller: the paths diverge
 COARSE = 2  # implicit trials with fewer steps a frame do not count as stalled
 SMALLER = Fraction(5, 4)  # steps of a slightly smaller size over those of the first explicit trial
-MOST, FAR = 4, 3.0  # steps of an explicit trial over those of the one before, at most; the ratio that is needed for that
+MOST = 4  # steps of an explicit trial over those of the one before, at most
 DISPERSION, IMPACT = 3.0, 1.25  # factors on the errors that velocities show
 SMOOTH_ORDER = 2.0  # of the integrators; that of sudden motion is this, or higher, only by chance
 IMPACT_ORDER = 1.25  # highest order that counts of explicit steps after impacts
@@ -188,7 +188,7 @@ class Refinement:
         Trials that show an order, or fail, are followed by one with twice as many.
         """
         few = len(self.trials) == self.tried < 3
-        return finest * (MOST if few and self.steps_over_last(tolerance) > FAR else 2)
+        return finest * (MOST if few and self.steps_over_last(tolerance) > REACH[EXPLICIT] else 2)
 
     def steps_needed(self, tolerance: float) -> int | None:
         """Steps of the run in the time of a frame, if the trials show how many; None if they do not yet."""

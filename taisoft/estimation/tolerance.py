@@ -1,7 +1,7 @@
 """Runs to a tolerance: trials (`trials`) choose integrator and dt, and give the error of the run.
 
 Trials go from coarse to fine (`refinement`), until one meets the tolerance or they show how many steps the run needs: at most
-twice as many explicit ones, or eight times as many implicit ones. Explicit steps cannot be coarser than stable, with which
+three times as many explicit ones, or eight times as many implicit ones. Explicit steps cannot be coarser than stable, with which
 they begin. A trial that meets the tolerance is the run, which is repeated only if frames or steps are observed, or an
 estimate by companions is asked for.
 
