@@ -105,7 +105,8 @@ class Guarded:
         contents = {name: self.__dict__[name] for name in self._contents if isinstance(self.__dict__[name], tuple)}
         for one in gone:
             if not any(one is item for items in contents.values() for item in items):
-                raise self._error(f"{self._label()}: remove: {value_text(one)} is none of its {', '.join(contents)}")
+                each = ": pass them one by one, as in remove(*items)" if isinstance(one, (list, tuple)) else ""
+                raise self._error(f"{self._label()}: remove: {value_text(one)} is none of its {', '.join(contents)}{each}")
         for name, items in contents.items():
             self._hold(name, [item for item in items if not any(item is one for one in gone)])
 

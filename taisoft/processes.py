@@ -10,7 +10,6 @@ import queue
 import signal
 import subprocess
 import sys
-import tempfile
 import threading
 from collections.abc import Callable
 from contextlib import suppress
@@ -65,7 +64,7 @@ class Link:
         """Return the next message, or None if there is none within the time [s]; None waits for one. Raises LinkClosed."""
         try:
             return from_json(self._connection.recv_bytes()) if self._connection.poll(timeout) else None
-        except (EOFError, OSError) as error:
+        except (EOFError, OSError, ValueError) as error:  # something else has written to it
             raise LinkClosed from error
 
     def close(self) -> None:
@@ -76,21 +75,31 @@ class Link:
 class Child:
     """A process at the other end of a link.
 
-    command, options: as for `start_python`; is_quiet: whether what it prints is kept and not shown. Raises OSError.
+    command, options: as for `start_python`; is_quiet: whether it prints nothing, and the end of its stderr is kept. Raises
+    OSError.
     """
 
     def __init__(self, *command: str, is_quiet: bool = True, **options):
-        self._printed = tempfile.TemporaryFile() if is_quiet else None
+        self._errors, self._reader = b"", None
         own, other = Pipe()
         self.link = Link(own)
         try:
-            streams = {"stdin": other.fileno(), "stdout": self._printed, "stderr": self._printed}
-            self._process = start_python(*command, **streams, **options)
+            streams = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE} if is_quiet else {}
+            self._process = start_python(*command, stdin=other.fileno(), **streams, **options)
         except OSError:
             own.close()
             raise
         finally:
             other.close()
+        if is_quiet:
+            self._reader = threading.Thread(target=self._keep_errors, args=(self._process.stderr,), daemon=True)
+            self._reader.start()
+
+    def _keep_errors(self, stream) -> None:
+        """Read what the process prints to stderr, of which only the end is kept."""
+        with stream:
+            while part := stream.read1():
+                self._errors = (self._errors + part)[-LINE_BYTES:]
 
     @property
     def pid(self) -> int:
@@ -115,10 +124,9 @@ class Child:
         return f"its process ended {how}{what}" + (f": {last}" if (last := self._last_line()) else "")
 
     def _last_line(self) -> str:
-        if self._printed is None:
-            return ""
-        self._printed.seek(max(0, self._printed.seek(0, os.SEEK_END) - LINE_BYTES))
-        return self._printed.read().decode(errors="replace").strip().rpartition("\n")[2]
+        if self._reader is not None:
+            self._reader.join(1.0)  # what it has started may still hold the other end
+        return self._errors.decode(errors="replace").strip().rpartition("\n")[2]
 
     def kill(self) -> None:
         """Kill the process and what it has started."""
@@ -147,7 +155,8 @@ def call(command: tuple[str, ...], request: dict, seconds: float | None = None, 
     child = Child(*command, **options)
     try:
         child.link.send(request)
-        return child.link.receive(seconds) or {"crash": f"its process was stopped after {seconds:.0f} s"}
+        answer = child.link.receive(seconds)
+        return {"crash": f"its process was stopped after {seconds:.0f} s"} if answer is None else answer
     except LinkClosed:
         return {"crash": child.how_it_ended()}
     finally:  # whatever ends the wait, such as a signal

@@ -326,7 +326,7 @@ def modes(scene: Scene, k: int, mass: str = "lumped") -> Modes:
     if dependents is not None:
         free.reshape(-1, 3)[dependents.node] = False
     n_free = int(free.sum())
-    checks.whole(k, f"modes: k, of {n_free} free axes,", range(1, n_free + 1))
+    checks.whole(k, f"modes: k ({n_free} axes are free)", range(1, n_free + 1))
     K = sp.block_diag([hooke_stiffness(b) for b in scene.bodies], format="csr")
     table = spring_table(scene, dependents)
     K = K if table is None else K + spring_stiffness(scene, table)

@@ -82,6 +82,4 @@ def names_of(option: str, text: str | None, known) -> tuple[str, ...] | None:
         return None
     if text.strip() == "none":
         return ()
-    return tuple(
-        checks.choice(name.strip(), f"--{option} {text}: a name other than none", tuple(known)) for name in text.split(",")
-    )
+    return tuple(checks.choice(name.strip(), f"--{option} {text}: each name", tuple(known)) for name in text.split(","))

@@ -64,9 +64,8 @@ class ErrorEstimator:
         self._start = sim.positions()
         self._excursion = 0.0
         self._energies = np.zeros(4)  # differences to the first companion at the last comparison [J]
-        self._means: list[
-            list[np.ndarray]
-        ] = []  # per comparison: mean positions of the bodies, of the run and its first companion
+        # per comparison: mean positions of the bodies, of the run and its first companion
+        self._means: list[list[np.ndarray]] = []
         try:
             with collected_warnings():  # the run has given them
                 self._make_companions(steps, mesh)

@@ -17,7 +17,7 @@ from taisoft.fem.model import Setup
 from taisoft.fem.pressure import pressures_of
 from taisoft.fem.spring_table import SpringTable
 from taisoft.scene.connection_records import Tendon
-from taisoft.scene.loads import DEAD, Activation, BodyLoad, ScalarLoad, value_at
+from taisoft.scene.loads import DEAD, FOLLOWER, Activation, BodyLoad, Cavity, Pressure, ScalarLoad, value_at
 from taisoft.scene.rigid import RigidBody
 from taisoft.scene.scene import Body, Scene
 
@@ -57,6 +57,7 @@ class SceneLoads:
         for body, start in zip(scene.bodies, starts):
             for kind, k, load in body.numbered_loads:
                 if load.feature != DEAD:
+                    _check_follower(body, load)
                     continue
                 nodes, weights = _weights(body, load)
                 if load.path is None:
@@ -174,6 +175,12 @@ def _shares(body: Body, load: BodyLoad) -> tuple[np.ndarray, np.ndarray]:
 
 # by kind of dead load: (body, load) -> the nodes (k,) of the body on which it acts, and their weights (k,)
 WEIGHTS: dict[str, Callable[[Body, BodyLoad], tuple[np.ndarray, np.ndarray]]] = {"traction": _areas, "force": _shares}
+
+
+def _check_follower(body: Body, load: BodyLoad) -> None:
+    """Raise SimulationError for a kind that says it is a pressure, and is not: one that follows otherwise has its own feature."""
+    if load.feature == FOLLOWER and not isinstance(load, (Pressure, Cavity)):
+        raise SimulationError(f"body {body.name!r}: no forces are known of a {load.kind}: give its class a feature of its own")
 
 
 def _weights(body: Body, load: BodyLoad) -> tuple[np.ndarray, np.ndarray]:

@@ -79,7 +79,7 @@ def read_mesh(path, fix_orientation: bool = False, weld: float | None = None, re
 
 def from_meshio(mesh, *options) -> TetMesh:
     """Return the tets of a meshio.Mesh, as `TetMesh.from_meshio`. options: its other arguments. Raises MeshError."""
-    instance(mesh, "from_meshio: mesh", meshio.Mesh, error=MeshError)
+    instance(mesh, "from_meshio: mesh of meshio", meshio.Mesh, error=MeshError)
     return _clean_mesh("meshio.Mesh", content_of(mesh), *options)
 
 

@@ -217,7 +217,7 @@ def tetrahedralize(surface: SurfaceMesh, edge_length: float | None = None, envel
     faults, and of the volume with holes closed. The mesh's surface gets the uvs and subsets of the nearest triangles. Raises
     MeshError if the extra `mesh` is missing, nothing is enclosed, or the mesher fails.
     """
-    surface = instance(as_surface(surface), "tetrahedralize: surface, as of read_surface,", SurfaceMesh, error=MeshError)
+    surface = instance(as_surface(surface), "tetrahedralize: surface (see read_surface)", SurfaceMesh, error=MeshError)
     name, diagonal = surface.source, float(np.linalg.norm(np.ptp(surface.vertices, axis=0)))
     lengths = {"above": 0.0, "below": diagonal, "unit": "m, the surface's diagonal", "error": MeshError}
     edge_length = diagonal / EDGES_PER_DIAGONAL if edge_length is None else number(edge_length, f"{name}: edge_length", **lengths)

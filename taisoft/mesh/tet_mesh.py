@@ -84,7 +84,7 @@ class TetMesh(Guarded):
     name}, of regions that have one. mid_edge: (k,3) float64 [m], the nodes on the edges of a second-order mesh, which
     curve bodies of order 2, or None. fibres: (m,3) directions of fibres, of any length, 0 in tets without, or None. surface_uvs:
     (t,3,2) texture coordinates of the corners of `surface`, or None; surface_subsets: {name: rows (k,) of it}, without common
-    ones, such as those of one material. warnings: list of str, each also issued as a UserWarning. recipe: for a mesh from
+    ones, such as those of one material. warnings: texts, each also issued as a UserWarning. recipe: for a mesh from
     `box_mesh`, `sheet_mesh`, `ball_mesh` or `cylinder_mesh` the shape's name and the arguments that reproduce its arrays, else
     None.
     """

@@ -96,7 +96,7 @@ class Body(Guarded):
     }
     _contents = {
         "constraints": "call body.fix, body.move or body.remove",
-        "loads": "call body.add_force, body.add_traction, body.add_pressure or body.remove",
+        "loads": "call body.add_force, add_traction, add_pressure, add_cavity, add_load or remove",
     }
     _takes: ClassVar = LOAD_KINDS  # kinds of loads that may act on it
     _takes_rule: ClassVar[str] = ""  # of others

@@ -1,5 +1,6 @@
 """Loads of a body as methods: each function whose first argument is `self` is one of `Body`, whose class body lists them."""
 
+import inspect
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -20,7 +21,12 @@ def add_load(self: "Body", kind: str, where, *value, **arguments) -> BodyLoad:
 
     where, value, arguments: as `of` of its class takes them. Raises SceneError.
     """
-    what = self._check_open(f"add_{checks.choice(kind, f'{self._label()}: add_load: kind', tuple(LOAD_KINDS))}")
+    checks.choice(kind, f"{self._label()}: add_load: kind", tuple(LOAD_KINDS))
+    what = self._check_open(f"add_{kind}" if hasattr(self, f"add_{kind}") else "add_load")
+    try:
+        inspect.signature(LOAD_KINDS[kind].of).bind(self, what, where, *value, **arguments)
+    except TypeError as error:
+        raise SceneError(f"{what}: {kind}: {error}") from None
     if kind not in self._takes:
         raise SceneError(f"{self._label()}: {self._takes_rule}")
     order, load = list(LOAD_KINDS).index, LOAD_KINDS[kind].of(self, what, where, *value, **arguments)

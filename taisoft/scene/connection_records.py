@@ -92,9 +92,8 @@ class Attachment:
     a: str
     nodes: np.ndarray  #: (k,) int64 node ids of body a
     b: str  #: name of a body or obstacle
-    stiffness: float | None = checked(
-        number, None, above=0.0, unit="N/m"
-    )  #: of each node's spring; None: it moves with b exactly
+    #: [N/m] of each node's spring; None: it moves with b exactly
+    stiffness: float | None = checked(number, None, above=0.0, unit="N/m")
     damping: float = checked(number, 0.0, minimum=0.0, unit="N s/m")  #: of each node
     where: Callable | None = None  #: as in `Constraint`
     reach: float = MAX_OUTSIDE  #: heights of a tet by which the nodes may lie outside body b

@@ -93,7 +93,7 @@ def _plain(value) -> list:
         return [part for one in value for part in _plain(one)]
     if isinstance(value, KeyFrames):
         return [value.times, value.translations, value.rotations, value.pivot, value.smooth, value.release, value.values]
-    return ["function"] if callable(value) else [value]
+    return ["function"] if callable(value) else [value.item() if isinstance(value, np.generic) else value]
 
 
 def _robot_parts(placed: PlacedRobot) -> list:

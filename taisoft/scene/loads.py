@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from taisoft.scene.body import Body
 
 LOAD_KINDS: dict[str, type["BodyLoad"]] = {}  # by kind; a body's loads are counted in this order
+RESERVED = ("fix", "move", "activate", "mesh", "material", "materials", "curve", "skin")  # keys of bodies in scene files
 DEAD, FOLLOWER = "loads", "pressure"  # features of a plan: loads that do not follow the motion, and those that do
 
 
@@ -93,6 +94,14 @@ def load_kind(kind: str, call: str = "") -> Callable[[type], type]:
     """
 
     def register(cls: type) -> type:
+        if kind in RESERVED:
+            raise SceneError(f"load kind {kind!r}: scene files have another use for this name")
+        if cls.feature == DEAD and isinstance(cls.shapes, tuple) and () in cls.shapes:
+            raise SceneError(
+                f"load kind {kind!r}: the values of a dead load have shape (3,): its forces on nodes are weights times them"
+            )
+        if cls.arrows and cls.items != "triangles":
+            raise SceneError(f"load kind {kind!r}: arrows are drawn on triangles")
         call_now = call or f"sim.set_load(body, {kind!r}, index, value)"
         cls.kind, cls.set_by = kind, f"call {call_now}"
         if "given" not in cls.__annotations__:

@@ -242,7 +242,8 @@ def change_load(body: Body, kind: str, index: int, value) -> None:
     what = f"body {body.name!r}: set_{checks.choice(kind, f'body {body.name!r}: set_load: kind', tuple(LOAD_KINDS))}"
     rows = [k for k, one in enumerate(body.loads) if one.kind == kind]
     if not rows:
-        raise SceneError(f"{what}: it has no {kind}: give it one of 0 by body.add_{kind} before the Simulator is made")
+        call = f"add_{kind}" if hasattr(body, f"add_{kind}") else f"add_load({kind!r}, ...)"
+        raise SceneError(f"{what}: it has no {kind}: give it one of 0 by body.{call} before the Simulator is made")
     row = rows[checks.whole(index, f"{what}: index", range(len(rows)))]
     old = body.loads[row]
     new = replace(old, value=checks.array(value, f"{what}: {kind} {index}", old.shapes), path=None, path_shape=None)

@@ -339,8 +339,16 @@ class Scene(Guarded):
         return self.add_obstacle(HalfSpace(point, UP[self.up]), name, friction, restitution, None, colour, opacity)
 
     def remove(self, *gone: Body | Obstacle | Connection) -> None:
-        """Remove bodies, obstacles and connections. Raises SceneError for one that the scene does not have."""
+        """Remove bodies, obstacles and connections, with what was set for their contacts.
+
+        Raises SceneError for one that the scene does not have, for robots, and for their links.
+        """
+        for placed in self.robots:
+            if any(one is placed or getattr(one, "name", None) in placed.shapes for one in gone):
+                raise SceneError(f"scene: remove: robot {placed.name!r} and its links cannot be removed: make a scene without it")
         self._remove(*gone)
+        names = {one.name for one in self.colliders}
+        self._hold("contact_pairs", {pair: numbers for pair, numbers in self.contact_pairs.items() if pair <= names})
 
     def body(self, name: str) -> Body:
         """Return the body with this name. Raises SceneError if there is none."""

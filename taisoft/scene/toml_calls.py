@@ -197,4 +197,4 @@ def stored(value, what: str):
         return [value.owner, value.position.tolist()]
     if isinstance(value, tuple):
         return [stored(one, what) for one in value]
-    return float(value) if isinstance(value, np.ndarray) and not value.ndim else value
+    return value.item() if isinstance(value, (np.ndarray, np.generic)) and not value.ndim else value

@@ -39,10 +39,13 @@ class History:
         self.last = np.where(np.arange(len(QUANTITIES)) < 4, 0.0, np.nan)
         self.times, self.low, self.high = np.array([sim.time]), self.last[None], self.last[None]
 
-    def take(self, report: StepReport, seconds: float, errors: ErrorEstimate | None = None, **more: float) -> None:
+    def take(
+        self, report: StepReport, seconds: float, met: dict[str, bool], errors: ErrorEstimate | None = None, **more: float
+    ) -> None:
         """Record a step, or a batch of explicit steps.
 
-        seconds: its total wall time [s]; errors: so far, if estimated; more: columns by pair or body, 0 for those of other steps.
+        seconds: its total wall time [s]; met: which `needs` of series the step meets: of others, quantities are NaN; errors: so
+        far, if estimated; more: columns by pair or body, 0 for those of other steps.
         """
         changes = _energies(report) - self._start_energies
         found = vars(report) | dict(zip(QUANTITIES, [*changes, changes.sum()]))
@@ -50,6 +53,7 @@ class History:
         found |= {"step_time": 1e3 * seconds / report.steps}
         percent = 100.0 * np.array([getattr(errors, kind, None) for kind in ERROR_KINDS], dtype=float)
         found |= dict(zip((f"{kind}_error" for kind in ERROR_KINDS), percent))
+        found |= {one.quantity: np.nan for plot in PLOTS.values() for one in plot.series if not met.get(one.needs, True)}
         row = np.array([found[name] for name in QUANTITIES], dtype=float)
         if new := [name for name in more if name not in self.columns]:
             self.columns += new
@@ -139,7 +143,7 @@ class Plots(PlotChoice):
     def take(self, report: StepReport, seconds: float) -> None:
         """Record a step report; seconds: its wall time [s]. For `on_step` of a run."""
         errors = self._sim.error_so_far if self._errors else None
-        self.history.take(report, seconds, errors, **self._by_name())
+        self.history.take(report, seconds, self.enabled, errors, **self._by_name())
 
     def _by_name(self) -> dict[str, float]:
         """Return the columns of the requested plots by pair or body: forces [N], torques [N m] and energies [J]."""

@@ -129,7 +129,7 @@ def test_other_elements_are_refused_by_name_and_number(tmp_path):
         for read, given in ((read_mesh, path), (TetMesh.from_meshio, meshio.Mesh(MESH.vertices, cells))):
             with pytest.raises(MeshError, match=refusal):
                 read(given)
-    with pytest.raises(MeshError, match="^from_meshio: mesh must be a Mesh, not str$"):
+    with pytest.raises(MeshError, match="^from_meshio: mesh of meshio must be a Mesh, not str$"):
         TetMesh.from_meshio("part.msh")
 
 

@@ -13,6 +13,7 @@ from taisoft.mesh.nodes import make_nodes
 from taisoft.mesh.shapes import ball_mesh, box_mesh, sheet_mesh
 from taisoft.scene.collision import CollisionSettings, has_sharp_edges, principal_extents
 from taisoft.scene.fingerprint import scene_digest
+from taisoft.scene.loads import LOAD_KINDS, BodyLoad, load_kind
 from taisoft.scene.obstacles import Box, HalfSpace, Sphere
 from taisoft.scene.scene import Material, Scene
 
@@ -269,3 +270,41 @@ def test_edges_are_sharp_if_they_are_convex_by_more_than_60_degrees():
 def test_principal_extents_are_the_sides_of_a_turned_box():
     box, turn = box_mesh((2, 1, 3), (1, 2, 3)), np.linalg.qr(np.random.default_rng(0).standard_normal((3, 3)))[0]
     assert sorted(principal_extents(box.vertices @ turn.T + (5, 6, 7), box.surface)) == pytest.approx([1, 2, 3])
+
+
+def test_what_is_removed_takes_its_contacts_with_it(scene):
+    a, b = scene.bodies
+    scene.set_contact(a.name, b.name, friction=0.3)
+    scene.remove(b)
+    assert not scene.contact_pairs and scene.bodies == (a,)
+    with pytest.raises(SceneError, match=r"remove: .* is none of its bodies.*: pass them one by one, as in remove\(\*items\)"):
+        scene.remove([a])
+
+
+def test_kinds_of_loads_are_checked(scene, monkeypatch):
+    monkeypatch.setattr("taisoft.scene.loads.LOAD_KINDS", dict(LOAD_KINDS))
+
+    class Own(BodyLoad):
+        items = "triangles"
+
+    class Scalar(Own):
+        shapes = ((),)
+
+    class OnNodes(BodyLoad):
+        items, arrows = "nodes", "tractions"
+
+    for cls, kind, message in (
+        (Own, "fix", "'fix': scene files have another use for this name"),
+        (Scalar, "own", "'own': the values of a dead load have shape"),
+        (OnNodes, "own", "'own': arrows are drawn on triangles"),
+    ):
+        with pytest.raises(SceneError, match=f"^load kind {message}"):
+            load_kind(kind)(cls)
+    body = scene.bodies[0]
+    for call, message in (
+        (lambda: body.add_load("wind", [0], 1.0), "add_load: kind must be one of traction, force, pressure, cavity, not 'wind'"),
+        (lambda: body.add_load("force", [0]), "add_force: force: missing a required argument: 'force'"),
+        (lambda: body.add_load("force", [0], (1, 0, 0), strength=2.0), "add_force: force: got an unexpected keyword argument"),
+    ):
+        with pytest.raises(SceneError, match=message):
+            call()

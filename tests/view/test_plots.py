@@ -33,7 +33,7 @@ def started(capacity: int = 8, time: float = 0.0, kinetic: float = 0.0) -> Histo
 def test_entries_hold_the_extremes_of_their_steps(values, capacity):
     history = started(capacity)
     for k, value in enumerate(values):
-        history.take(StepReport(time=k + 1.0, kinetic=value, elastic=1.0, gravity=2.0, n_contacts=k), 0.001)
+        history.take(StepReport(time=k + 1.0, kinetic=value, elastic=1.0, gravity=2.0, n_contacts=k), 0.001, {})
     kinetic, steps, n = np.array([0.0, *values]), np.arange(len(values) + 1.0), len(history.times)
     length = 2 ** math.ceil(math.log2(len(kinetic) / n))
     assert n <= capacity and (length == 1 or 2 * n > capacity) and history.times[-1] == len(values)
@@ -45,17 +45,20 @@ def test_entries_hold_the_extremes_of_their_steps(values, capacity):
         assert history.times[j] == steps[covered][-1]
 
 
-def test_energies_are_changes_and_other_quantities_those_of_a_step():
+def test_energies_are_changes_and_unmodelled_quantities_are_nan():
     history = started(kinetic=10.0, time=3.0)
     energies = {"kinetic": 11.0, "elastic": 3.0, "gravity": -1.0}
+    implicit = {"newton_residual": 1e-5, "newton_iterations": 2, "linear_iterations": 30}
     solved = {"residual": 1e-5, "newton_iterations": 2, "linear_iterations": 30, "contact_residual": float("inf")}
     report = StepReport(time=3.1, steps=4, contact_iterations=8, n_contacts=5, **energies, **solved)
-    expected = {"kinetic": 1.0, "elastic": 2.0, "gravity": -3.0, "total": 0.0, "step_time": 5.0, "newton_residual": 1e-5}
-    expected |= {"newton_iterations": 2, "linear_iterations": 30, "contact_iterations": 2.0, "n_contacts": 5}
-    history.take(report, 0.02)
-    assert {name: value for name, value in zip(QUANTITIES, history.last) if np.isfinite(value)} == pytest.approx(expected)
+    expected = {"kinetic": 1.0, "elastic": 2.0, "gravity": -3.0, "total": 0.0, "step_time": 5.0}
+    for solves, touching in ((True, True), (False, True), (False, False), (True, False)):
+        history.take(report, 0.02, {"implicit": solves, "contact": touching})
+        modelled = expected | (implicit if solves else {})
+        modelled |= {"contact_iterations": 2.0, "n_contacts": 5} if touching else {}
+        assert {name: value for name, value in zip(QUANTITIES, history.last) if np.isfinite(value)} == pytest.approx(modelled)
     assert history.begin == 3.0
-    history.take(report, 0.02, ErrorEstimate(time=0.012, excursion=1.0, energies=Energies(0.1, 0.2, 0.3)))
+    history.take(report, 0.02, {}, ErrorEstimate(time=0.012, excursion=1.0, energies=Energies(0.1, 0.2, 0.3)))
     assert history.last[QUANTITIES.index("time_error")] == pytest.approx(1.2)
     assert history.low[-1, :4] == pytest.approx([0.9, 1.8, -3.3, -0.6]), "energies less their errors"
     assert history.high[-1, :4] == pytest.approx([1.1, 2.2, -2.7, 0.6])
