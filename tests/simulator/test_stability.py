@@ -78,7 +78,7 @@ def test_free_bodies_have_six_rigid_motions_each_and_bad_arguments_are_refused()
     assert np.abs(frequencies[:12]).max() < 1e-2 * frequencies[12]
     scene = one_body(constrained=True)
     for k, mass, message in (
-        (0, "lumped", "k, of 23 free axes, must be a whole number from 1 to 23, not 0"),
+        (0, "lumped", "k .23 axes are free. must be a whole number from 1 to 23, not 0"),
         (24, "lumped", "not 24"),
         (3, "none", "mass must be one of lumped, consistent, not 'none'"),
     ):
