@@ -96,9 +96,9 @@ class Runs:
             record = self.store.read(key)
             if record is None:
                 record = self._run(key, request, seconds)
-                told = f"{name}: {record[LEFT_OUT] if LEFT_OUT in record else summary(record)}"
-                progress(f"{number} of {len(requests)}: {told}")
-                self.missing += [told] * (LEFT_OUT in record)
+                outcome = f"{name}: {record[LEFT_OUT] if LEFT_OUT in record else summary(record)}"
+                progress(f"{number} of {len(requests)}: {outcome}")
+                self.missing += [outcome] * (LEFT_OUT in record)
             yield record
 
     def finish(self, document: Document, options: argparse.Namespace, numbers: dict, limits: Sequence[Limit] = (), **more) -> int:

@@ -65,8 +65,10 @@ class Guarded:
     def _held(self, name: str, items) -> "Contents | FrozenDict":
         """Return a copy of items that refuses changes by hand. name: the attribute that has them."""
         held = FrozenDict(items) if isinstance(items, dict) else Contents(items)
-        by_hand = f"{self._label()}: {name} cannot be changed by hand: {self._rule(name)}"
-        held._refusal = self._frozen_error(name) if self._frozen else self._error(by_hand)
+        if self._frozen:
+            held._refusal = self._frozen_error(name)
+        else:
+            held._refusal = self._error(f"{self._label()}: {name} cannot be changed by hand: {self._rule(name)}")
         return held
 
     def _hold(self, name: str, items) -> None:

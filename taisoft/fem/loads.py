@@ -143,8 +143,11 @@ def scalar_loads(scene: Scene) -> list[tuple[str, ScalarLoad | Tendon]]:
     """The loads of a scene that are one number, each with its name in messages, in the order of the model's `amplitudes`."""
     found: list[tuple[str, ScalarLoad | Tendon]] = []
     for body in scene.bodies:
-        found += [(f"body {body.name!r}: pressure {k}", load) for k, load in enumerate(body.pressures)]
-        found += [(f"cavity {cavity.name!r}", FOLLOWS if cavity.given == "volume" else cavity) for cavity in body.cavities]
+        for kind, k, load in body.numbered_loads:
+            if isinstance(load, Cavity):
+                found.append((f"cavity {load.name!r}", FOLLOWS if load.given == "volume" else load))
+            elif isinstance(load, Pressure):
+                found.append((f"body {body.name!r}: {kind} {k}", load))
     for body in scene.bodies:
         found += [(f"body {body.name!r}: activation", load) for load in body.activations]
     return found + [(f"tendon {one.name!r}", FOLLOWS if one.is_inextensible else one) for one in scene.tendons]

@@ -46,7 +46,7 @@ class PressureTable:
 
 def pressures_of(scene: Scene) -> list[tuple[int, Pressure | Cavity]]:
     """All pressures and cavities of a scene, each with the number of its body, in the order of Model.amplitudes."""
-    return [(k, load) for k, body in enumerate(scene.bodies) for load in (*body.pressures, *body.cavities)]
+    return [(k, load) for k, body in enumerate(scene.bodies) for load in body.loads if isinstance(load, (Pressure, Cavity))]
 
 
 @cache

@@ -176,8 +176,11 @@ class Body(Guarded):
     @property
     def numbered_loads(self) -> list[tuple[str, int, BodyLoad]]:
         """Its loads, each with its kind and its number in that kind, as `Simulator.set_load` counts."""
-        first = {kind: k for k, kind in reversed(list(enumerate(one.kind for one in self.loads)))}
-        return [(one.kind, k - first[one.kind], one) for k, one in enumerate(self.loads)]
+        found, counts = [], dict.fromkeys(LOAD_KINDS, 0)
+        for one in self.loads:
+            found.append((one.kind, counts[one.kind], one))
+            counts[one.kind] += 1
+        return found
 
     @property
     def fibres(self) -> np.ndarray | None:

@@ -1,6 +1,5 @@
 """Loads of a body as methods: each function whose first argument is `self` is one of `Body`, whose class body lists them."""
 
-import inspect
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -24,7 +23,7 @@ def add_load(self: "Body", kind: str, where, *value, **arguments) -> BodyLoad:
     checks.choice(kind, f"{self._label()}: add_load: kind", tuple(LOAD_KINDS))
     what = self._check_open(f"add_{kind}" if hasattr(self, f"add_{kind}") else "add_load")
     try:
-        inspect.signature(LOAD_KINDS[kind].of).bind(self, what, where, *value, **arguments)
+        LOAD_KINDS[kind].signature.bind(self, what, where, *value, **arguments)
     except TypeError as error:
         raise SceneError(f"{what}: {kind}: {error}") from None
     if kind not in self._takes:

@@ -5,6 +5,7 @@ acts, how scene files and checkpoints hold it, what a running simulation may cha
 the forces of a dead load on nodes from its row of `WEIGHTS` in `taisoft.fem.loads`.
 """
 
+import inspect
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
@@ -103,7 +104,7 @@ def load_kind(kind: str, call: str = "") -> Callable[[type], type]:
         if cls.arrows and cls.items != "triangles":
             raise SceneError(f"load kind {kind!r}: arrows are drawn on triangles")
         call_now = call or f"sim.set_load(body, {kind!r}, index, value)"
-        cls.kind, cls.set_by = kind, f"call {call_now}"
+        cls.kind, cls.set_by, cls.signature = kind, f"call {call_now}", inspect.signature(cls.of)
         if "given" not in cls.__annotations__:
             cls.given = kind
         LOAD_KINDS[kind] = guarded_record(kind, f"{cls.set_by} in a simulation")(cls)
