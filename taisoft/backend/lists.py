@@ -12,11 +12,12 @@ from typing import Any
 
 import taichi as ti
 
-from taisoft.backend.arrays import FieldArena, on_cuda
+from taisoft.backend.arrays import FieldArena
+from taisoft.backend.paths import gpu_threads, on_gpu_path
 
 # Taichi gives each CPU thread at least 512 iterations of a loop: each chunk takes that many, and only the first does the work
-SPREAD = {"cpu": 512, "cuda": 1}
-PARTS = {"cpu": 64, "cuda": 1024}  # of the counts, that are added up in parallel
+CPU_SPREAD = 512
+CPU_PARTS, GPU_PARTS = 64, 1024  # of the counts, that are added up in parallel
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,10 +31,15 @@ class Lists:
     spread: int  # loop iterations per part
 
 
+def spread_on(on_cpu: bool, serial: bool) -> int:
+    """Loop iterations per chunk. on_cpu: whether not on the GPU path; serial: whether one thread runs the loop."""
+    return CPU_SPREAD if on_cpu and not serial else 1
+
+
 def make_lists(arena: FieldArena, name: str, n_keys: int, serial: bool) -> Lists:
     """Allocate lists of up to n_keys keys."""
-    arch = "cuda" if on_cuda() else "cpu"
-    parts, spread = (1, 1) if serial else (PARTS[arch], SPREAD[arch])
+    parts = 1 if serial else gpu_threads(GPU_PARTS) if on_gpu_path() else CPU_PARTS
+    spread = spread_on(not on_gpu_path(), serial)
     start, sums = (arena.field(f"{name}_{what}", ti.i32, n) for what, n in (("start", n_keys + 2), ("sums", parts)))
     return Lists(start, sums, parts, serial, spread)
 

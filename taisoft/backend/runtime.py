@@ -23,6 +23,7 @@ from taisoft import compile_message
 from taisoft.backend import tracing  # noqa: F401  tracing: before any function is decorated
 from taisoft.backend.arrays import on_cuda
 from taisoft.backend.launching import Kernels
+from taisoft.backend.paths import on_gpu_path
 from taisoft.backend.private import impl
 from taisoft.errors import SimulationError
 from taisoft.files import cache_folders
@@ -47,7 +48,8 @@ class Runtime:
     """A claim on the process's Taichi runtime; `close` releases it.
 
     arch: "cpu" | "cuda"; precision: "f32" | "f64"; real: the Taichi type of everything but positions; lanes: number of
-    elements processed together (SIMD lanes on the CPU; 1 on CUDA, where threads run in parallel instead). owner: in messages.
+    elements processed together (SIMD lanes on the CPU; 1 on CUDA, where threads run in parallel instead). on_cpu: whether it does
+    not take the GPU path (`paths`). owner: in messages.
     """
 
     def __init__(self, arch: str, precision: str, owner: str):
@@ -55,7 +57,8 @@ class Runtime:
         self.real = PRECISIONS[precision]
         self.np_real = np.float32 if precision == "f32" else np.float64
         self.eps = float(np.finfo(self.np_real).eps)
-        self.lanes = CPU_LANES if arch == "cpu" else 1
+        self.on_cpu = not on_gpu_path()
+        self.lanes = CPU_LANES if self.on_cpu else 1
         self._program = _program
 
     def check(self) -> None:

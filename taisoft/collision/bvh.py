@@ -28,7 +28,7 @@ from taisoft.collision.colliders import Topology
 from taisoft.collision.surface import Surface, dvec, integers
 from taisoft.ranges import expand
 
-LEAVES = {"cpu": 64, "cuda": 8}  # triangles per chunk: the fastest of 4 to 256 on the CPU, small on CUDA for enough threads
+CPU_LEAVES, GPU_LEAVES = 64, 8  # triangles per chunk: the fastest of 4 to 256 on the CPU, small on CUDA for enough threads
 
 AXES = ((1, 0, 0), (0, 1, 0), (0, 0, 1))
 DIRECTIONS = {  # k -> normals of the slabs
@@ -211,12 +211,14 @@ class Bvh:
         """x: (n_verts, 3) [m], the positions that the trees are built for. k_dop: 6, 14 or 18. leaves: most triangles per chunk,
         None for the default."""
         self.surface, self.margin = surface, margin
-        self.tables = t = build_trees(x[topology.triangle].mean(axis=1), topology.first, leaves or LEAVES[runtime.arch])
+        self.tables = t = build_trees(
+            x[topology.triangle].mean(axis=1), topology.first, leaves or (CPU_LEAVES if runtime.on_cpu else GPU_LEAVES)
+        )
 
         slabs = {name: arena.vectors(f"bvh_{name}", ti.f64, max(len(t.link), 1), n=k_dop // 2) for name in ("lo", "hi")}
         indices = {name: integers(arena, f"bvh_{name}", getattr(t, name)) for name in ("link", "root", "chunk", "top")}
         self.trees = Trees(k_dop // 2, DIRECTIONS[k_dop], len(t.chunk), **indices, **slabs)
-        self.by_levels = runtime.arch != "cpu"  # else one thread refits the nodes above the chunks, in one launch
+        self.by_levels = not runtime.on_cpu  # else one thread refits the nodes above the chunks, in one launch
 
     def near(self) -> Trees:
         """Refit the trees to the present boxes and return them, for queries."""

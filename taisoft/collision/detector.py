@@ -148,7 +148,7 @@ class Detection:
         x = self._rest + np.repeat(shift, np.diff(topology.vertex_first), axis=0)
         if kind == "auto":  # on the CPU trees were faster at every size measured, but their roots are compared pairwise
             few_colliders = len(self.scene.colliders) <= MANY_COLLIDERS
-            kind = "bvh" if runtime.arch == "cpu" and few_colliders else "spatial_hash"
+            kind = "bvh" if runtime.on_cpu and few_colliders else "spatial_hash"
         if kind == "bvh":
             return Bvh(s, topology, x, self.reach, runtime, self._arena, settings.k_dop)
         extent = np.ptp(x[topology.triangle].reshape(-1, 3), axis=0)

@@ -14,7 +14,8 @@ import taichi as ti
 
 from taisoft.backend import parallel
 from taisoft.backend.arrays import Count, FieldArena
-from taisoft.backend.lists import SPREAD, part_first, sum_before
+from taisoft.backend.lists import part_first, spread_on, sum_before
+from taisoft.backend.paths import gpu_threads
 from taisoft.backend.runtime import Runtime, kernel
 from taisoft.collision.colliders import Topology
 
@@ -22,7 +23,7 @@ SERIAL_BELOW = 1500  # triangles below which one thread is faster than starting 
 # Of one thread per triangle: in the loops over nearby pairs, and in cheap loops (boxes, tree refit, sharp edges, reduction)
 TRIANGLE_SECONDS, CHEAP_SECONDS = 1e-7, 5e-9
 NOT_FINITE = 0x7FF  # exponent bits of infinite f64 numbers and of those that are no numbers
-CHUNKS = {"cpu": 64, "cuda": 4096}  # chunks of a list that are processed in parallel, each with its own part of a buffer
+CPU_CHUNKS, GPU_CHUNKS = 64, 4096  # chunks of a list that are processed in parallel, each with its own part of a buffer
 NONFINITE, ACTIVE, PAIRS = 0, 1, 2  # indices into Surface.count
 INSIDE_BITS = 31  # of Surface.inside; one vertex is almost never inside two colliders with the same bit
 
@@ -100,10 +101,10 @@ def build_surface(
     """
     t, bodies, attached = topology, len(properties["soft"]), properties.get("attached")
     n, v = len(t.triangle), len(t.node)
-    on_cpu = runtime.arch == "cpu"
+    on_cpu = runtime.on_cpu
     if serial is None and on_cpu and n < SERIAL_BELOW:
         serial = True
-    chunks, serial_cheap = 1 if serial else CHUNKS[runtime.arch], serial
+    chunks, serial_cheap = 1 if serial else CPU_CHUNKS if on_cpu else gpu_threads(GPU_CHUNKS), serial
     if serial is None:
         serial, serial_cheap = (on_cpu and not parallel.pays(n * seconds) for seconds in (TRIANGLE_SECONDS, CHEAP_SECONDS))
     tables = {name: getattr(t, name) for name in ("triangle", "body", "node", "neighbour", "owns")}
@@ -127,8 +128,8 @@ def build_surface(
         serial_cheap=serial_cheap,
         on_cpu=on_cpu,
         chunks=chunks,
-        spread=1 if serial else SPREAD[runtime.arch],
-        cheap_spread=1 if serial_cheap else SPREAD[runtime.arch],
+        spread=spread_on(on_cpu, serial),
+        cheap_spread=spread_on(on_cpu, serial_cheap),
         mode=integers(arena, "contact_mode", properties["mode"]),
         attached=integers(arena, "attached", attached.reshape(-1)) if attached is not None and attached.any() else None,
         rest=arena.vectors("surface_rest", ti.f64, max(v, 1), rest if v else None),

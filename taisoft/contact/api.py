@@ -116,7 +116,7 @@ def _problem(W: sp.csr_matrix, b: np.ndarray, mu: np.ndarray) -> Iterator[Contac
     runtime = open_runtime(arch, precision, "solve_contact_problem")
     try:
         W = W.tobsr((3, 3))
-        p = build_matrix_problem(FieldArena(), len(mu), len(W.indices), arch == "cpu")
+        p = build_matrix_problem(FieldArena(), len(mu), len(W.indices), runtime.on_cpu)
         fill_matrix_problem(p, W, b, mu)
         yield p
     finally:

@@ -17,9 +17,11 @@ import numpy as np
 import scipy.sparse as sp
 import taichi as ti
 
-from taisoft.backend.arrays import Count, FieldArena, download, on_cuda, upload
+from taisoft.backend.arrays import Count, FieldArena, download, upload
 from taisoft.backend.lists import Lists, add_up_counts, clear_counts, count_entry, make_lists, place_of_entry, sort_lists
+from taisoft.backend.paths import on_gpu_path
 from taisoft.backend.runtime import kernel
+from taisoft.backend.team import Team, make_team
 from taisoft.contact.prox import dvec, prox, scaled
 from taisoft.ranges import expand, owners
 
@@ -87,6 +89,7 @@ class ContactProblem:
     factor: Any  # 2-vectors: r-factors of normal and tangents [kg]; 0 if nothing can move
     r: Any  # 3-vectors: impulses [N s]
     sweep: SweepWork
+    team: Team  # of loops over the contacts
     # W as a matrix
     row_start: Any = None  # (capacity + 1) i32
     column: Any = None  # i32
@@ -146,7 +149,7 @@ def build_node_problem(arena: FieldArena, capacity: int, n_nodes: int, serial: b
     return ContactProblem(
         n,
         serial,
-        not on_cuda(),
+        not on_gpu_path(),
         False,
         n_nodes=n_nodes,
         past=past,
@@ -170,7 +173,7 @@ def build_matrix_problem(arena: FieldArena, n: int, n_blocks: int, serial: bool)
     return ContactProblem(
         n,
         serial,
-        not on_cuda(),
+        not on_gpu_path(),
         True,
         **_solver_fields(arena, n, serial),
         **_fields(arena, "row_start", ti.i32, n + 1),
@@ -193,6 +196,7 @@ def _solver_fields(arena: FieldArena, n: int, serial: bool) -> dict[str, Any]:
     )
     return {
         "sweep": sweep,
+        "team": make_team(arena, "problem"),
         **_fields(arena, "count", ti.i32, 3),
         **_fields(arena, "friction", ti.f64, n),
         **_fields(arena, "b r", ti.f64, n, 3),

@@ -17,7 +17,6 @@ from taisoft.backend.runtime import kernel
 from taisoft.contact.build import contact_offset_of
 from taisoft.contact.problem import RESIDUAL, ContactProblem, residual_of
 from taisoft.contact.prox import OPEN, dvec, into_disk, prox, scaled, state_of
-from taisoft.fem.chunks import THREADS, block_total, share
 from taisoft.fem.model import Model
 from taisoft.linear.block_csr import BLOCK
 from taisoft.linear.coupling import NO_COUPLING, Coupling, build_coupling
@@ -219,8 +218,8 @@ def impulse_on_node(contacts: ti.template(), i):
 
 
 @ti.func
-def sum_residual(contacts: ti.template(), t, threads: ti.template()):
-    """Compute the residual of the laws over all contacts, by all threads t of a block.
+def sum_residual(contacts: ti.template(), t):
+    """Compute the residual of the laws over all contacts, by all threads t of the team.
 
     It is relative to all impulses, so that a light contact beside heavy ones could let its gap close. The largest part of its
     target, or of the contact offset if that is less, by which a gap ends short is therefore a residual, too: MAX_MISSED
@@ -228,28 +227,23 @@ def sum_residual(contacts: ti.template(), t, threads: ti.template()):
     """
     rows, work = ti.static((contacts.problem, contacts.work))
     sums, worst = ti.Vector([0.0, 0.0], ti.f64), ti.cast(0.0, ti.f64)
-    for j in range(share(t, rows.count[0], threads)):
-        one = work.prox_residual[t + j * threads]
+    for j in range(rows.team.share(t, rows.count[0])):
+        one = work.prox_residual[rows.team.entry(t, j, rows.count[0])]
         sums += ti.Vector([one[0], one[1]], ti.f64)
         worst = ti.max(worst, one[2])
     for j in ti.static(range(2)):
-        sums[j] = block_total(sums[j], t, threads, False)
-    worst = block_total(worst, t, threads, True)
+        sums[j] = rows.team.total(t, sums[j])
+    worst = rows.team.largest(t, worst)
     if t == 0:
         rows.sweep.state[RESIDUAL] = ti.max(residual_of(sums), worst)
 
 
 @ti.func
 def find_residual(contacts: ti.template()):
-    """`sum_residual` as a top-level loop of a kernel: on the CPU on one thread, on CUDA by those of a block."""
-    if ti.static(contacts.problem.on_cpu):
-        ti.loop_config(serialize=True)
-        for _ in range(1):
-            sum_residual(contacts, 0, 1)
-    else:
-        ti.loop_config(block_dim=THREADS)
-        for t in range(THREADS):
-            sum_residual(contacts, t, THREADS)
+    """`sum_residual` as a top-level loop of a kernel."""
+    ti.loop_config(serialize=contacts.problem.team.alone, block_dim=contacts.problem.team.threads)
+    for t in range(contacts.problem.team.threads):
+        sum_residual(contacts, t)
 
 
 @kernel

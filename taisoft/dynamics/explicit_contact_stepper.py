@@ -31,7 +31,7 @@ class ContactExplicitStepper(ExplicitStepper):
         super().__init__(simulation, settings)
         self.contact, self.method = contact, settings.contact_solver
         if self.method == "auto":
-            self.method = "gauss_seidel" if settings.arch == "cpu" else "coloured_gauss_seidel"
+            self.method = "gauss_seidel" if simulation.model.on_cpu else "coloured_gauss_seidel"
         self.max_batch = min(self.max_batch, MAX_CONTACT_BATCH)
         self.contact_tolerance = settings.contact_tolerance or TOLERANCE[settings.precision]
         self._rigid = RigidContacts(simulation.model) if simulation.model.has_rigid_tets else None

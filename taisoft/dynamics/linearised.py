@@ -20,7 +20,7 @@ from taisoft.dynamics.contact_terms import (
     update_contact,
 )
 from taisoft.dynamics.stage import norm_weight, place_node
-from taisoft.fem.chunks import THREADS, block_total, chunk_entry, chunk_size, fold, share, total
+from taisoft.fem.chunks import chunk_entry, chunk_size, fold, total
 from taisoft.fem.state import NORMS, OTHER_SUM, STEP_LENGTH, SUM
 from taisoft.linear.block_csr import block_times, off_diagonal_times
 from taisoft.linear.pcg_work import dot64
@@ -59,27 +59,27 @@ def end_linearised(m: ti.template(), stage: ti.template(), contacts: ti.template
 
 
 @ti.func
-def _slope(contacts: ti.template(), linear_slope, curvature, a, r_scale, t, threads: ti.template()):
-    """Return the slope of the augmented Lagrangian at step length a, by all threads t of a block. linear_slope: e.r_lin."""
+def _slope(contacts: ti.template(), linear_slope, curvature, a, r_scale, t):
+    """Return the slope of the augmented Lagrangian at step length a, by all threads t of the team. linear_slope: e.r_lin."""
     rows, work = ti.static((contacts.problem, contacts.work))
     slope = linear_slope + a * curvature
     if t > 0:
         slope = 0.0
-    for j in range(share(t, rows.count[0], threads)):
-        c = t + j * threads
+    for j in range(rows.team.share(t, rows.count[0])):
+        c = rows.team.entry(t, j, rows.count[0])
         z = unprojected_impulse(contacts, c, work.velocity[c] + a * work.rate[c], r_scale)
         slope -= work.rate[c].dot(projected_impulse(contacts, c, z))
-    return block_total(slope, t, threads, False)
+    return rows.team.total(t, slope)
 
 
 @ti.func
-def _root(contacts: ti.template(), linear_slope, curvature, start, r_scale, t, threads: ti.template()):
+def _root(contacts: ti.template(), linear_slope, curvature, start, r_scale, t):
     """Return the root of the slope by the Illinois method; the slope increases if the matrix is positive definite.
 
-    All threads t of a block call it, with the same numbers.
+    All threads t of the team call it, with the same numbers.
     """
     a, low, at_low, high, at_high = 1.0, 0.0, start, -1.0, 0.0
-    slope = _slope(contacts, linear_slope, curvature, a, r_scale, t, threads)
+    slope = _slope(contacts, linear_slope, curvature, a, r_scale, t)
     tries = 0
     while ti.abs(slope) > ROOT * ti.abs(start) and tries < TRIES and a < LONGEST:
         if slope > 0.0:
@@ -92,24 +92,24 @@ def _root(contacts: ti.template(), linear_slope, curvature, start, r_scale, t, t
             a *= 2.0
         else:
             a = low + (high - low) * ti.min(ti.max(at_low / (at_low - at_high), 0.01), 0.99)
-        slope = _slope(contacts, linear_slope, curvature, a, r_scale, t, threads)
+        slope = _slope(contacts, linear_slope, curvature, a, r_scale, t)
         tries += 1
     return a
 
 
 @ti.func
-def _find_step_length(m: ti.template(), contacts: ti.template(), r_scale, t, threads: ti.template()):
-    """Set STEP_LENGTH, by all threads t of a block, from the sums over the nodes and the contacts' rates."""
+def _find_step_length(m: ti.template(), contacts: ti.template(), r_scale, t):
+    """Set STEP_LENGTH, by all threads t of the team, from the sums over the nodes and the contacts' rates."""
     rows, work = ti.static((contacts.problem, contacts.work))
     start = total(m, SUM)
     linear_slope = start
     if t > 0:
         linear_slope = 0.0
-    for j in range(share(t, rows.count[0], threads)):
-        c = t + j * threads
+    for j in range(rows.team.share(t, rows.count[0])):
+        c = rows.team.entry(t, j, rows.count[0])
         linear_slope += work.rate[c].dot(rows.r[c])
-    linear_slope = block_total(linear_slope, t, threads, False)
-    length = _root(contacts, linear_slope, total(m, OTHER_SUM), start, r_scale, t, threads)
+    linear_slope = rows.team.total(t, linear_slope)
+    length = _root(contacts, linear_slope, total(m, OTHER_SUM), start, r_scale, t)
     if t == 0:
         m.state.scalars[STEP_LENGTH] = length
 
@@ -192,14 +192,9 @@ def find_step_length(
     ti.loop_config(serialize=rows.serial)
     for c in range(rows.count[0]):
         _contact_slope(stage, contacts, c, beta)
-    if ti.static(m.on_cpu):
-        ti.loop_config(serialize=True)
-        for _ in range(1):
-            _find_step_length(m, contacts, r_scale, 0, 1)
-    else:
-        ti.loop_config(block_dim=THREADS)
-        for t in range(THREADS):
-            _find_step_length(m, contacts, r_scale, t, THREADS)
+    ti.loop_config(serialize=rows.team.alone, block_dim=rows.team.threads)
+    for t in range(rows.team.threads):
+        _find_step_length(m, contacts, r_scale, t)
 
 
 @kernel

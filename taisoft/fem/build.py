@@ -13,6 +13,7 @@ import taichi as ti
 
 from taisoft.backend import parallel
 from taisoft.backend.arrays import FieldArena
+from taisoft.backend.paths import gpu_threads
 from taisoft.backend.runtime import Runtime
 from taisoft.fem import dependents, elements, fibres, loads, masses, mean_dilatation, pressure, rigid_tets, springs, viscosity
 from taisoft.fem.model import Group, Layout, Model, Setup
@@ -48,7 +49,7 @@ def build_model(scene: Scene, runtime: Runtime, arena: FieldArena, on: dict[str,
         **chunks,
         real=runtime.real,
         lanes=runtime.lanes,
-        on_cpu=runtime.arch == "cpu",
+        on_cpu=runtime.on_cpu,
         n_nodes=n_nodes,
         state=state,
         terms=terms_of(setup.on),
@@ -66,5 +67,5 @@ def _chunks(runtime: Runtime, groups: tuple[Group, ...]) -> dict[str, Any]:
     """Into how many chunks loops over the model are divided, and whether one thread runs them all."""
     seconds = 3e-9  # of one thread per quadrature point, in the loops with least work
     work = sum((group.last - group.first) * runtime.lanes * group.n_points for group in groups)
-    chunks = {"cpu": 1 if work < CHUNKED_FROM else 32, "cuda": 65_536}[runtime.arch]
-    return {"chunks": chunks, "serial": runtime.arch == "cpu" and (chunks == 1 or not parallel.pays(work * seconds))}
+    chunks = (1 if work < CHUNKED_FROM else 32) if runtime.on_cpu else gpu_threads(65_536)
+    return {"chunks": chunks, "serial": runtime.on_cpu and (chunks == 1 or not parallel.pays(work * seconds))}

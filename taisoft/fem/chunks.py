@@ -14,7 +14,6 @@ import taichi as ti
 from taisoft.backend.lists import part_first
 
 FOLDED = 512  # partial sums that `fold` leaves on CUDA; of more chunks than these, a multiple
-THREADS = 256  # CUDA threads that share a loop with sums which each of them needs
 # Most chunks of a sweep, and 2^this is the least number of their nodes: the more chunks, the more rows couple them
 SWEEP_CHUNKS, MIN_SHIFT = 16, 11
 WHOLE = 30  # shift of a sweep that is not divided
@@ -94,34 +93,3 @@ def total(m: ti.template(), column: ti.template()):
     for c in range(m.sums):
         s += m.state.partial[c, column]
     return s
-
-
-@ti.func
-def share(t, n, threads: ti.template()):
-    """Return how many of n entries thread t takes: t, t + threads and so on."""
-    return (n - t + threads - 1) // threads
-
-
-@ti.func
-def block_total(value, t, threads: ti.template(), largest: ti.template()):
-    """Sum of the f64 values of all threads t of a block, in a fixed order, or with `largest` the largest value.
-
-    All threads must call it together. It is the value itself if there is one thread.
-    """
-    result = value
-    if ti.static(threads > 1):
-        shared = ti.simt.block.SharedArray((threads,), ti.f64)
-        shared[t] = value
-        ti.simt.block.sync()
-        half = threads // 2
-        while half > 0:
-            if t < half:
-                if ti.static(largest):
-                    shared[t] = ti.max(shared[t], shared[t + half])
-                else:
-                    shared[t] = shared[t] + shared[t + half]
-            ti.simt.block.sync()
-            half //= 2
-        result = shared[0]
-        ti.simt.block.sync()
-    return result

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from taisoft.backend.arrays import Count, FieldArena
-from taisoft.backend.lists import SPREAD
+from taisoft.backend.lists import spread_on
 from taisoft.backend.runtime import Runtime
 from taisoft.fem.chunks import FOLDED, SweepOrder
 from taisoft.fem.dependent_table import DependentTable
@@ -100,7 +100,7 @@ class Model:
     @property
     def spread(self) -> int:
         """Iterations of a loop per chunk, see `backend.lists`."""
-        return 1 if self.serial else SPREAD["cpu" if self.on_cpu else "cuda"]
+        return spread_on(self.on_cpu, self.serial)
 
     @property
     def sums(self) -> int:
