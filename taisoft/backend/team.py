@@ -5,7 +5,7 @@ On CUDA a team is one block of threads. A kernel has one loop over them, whose b
     ti.loop_config(serialize=team.alone, block_dim=team.threads)
     for t in range(team.threads):
         for j in range(team.share(t, n)):        # a phase: entries in any order
-            i = team.entry(t, j, n)
+            i = team.entry(t, j, n)              # or team.term(t, j): in a fixed one, for sums
             ...
         team.sync()                              # before a phase that reads what others have written
         total = team.total(t, value)             # the same number for all threads; all must call it
@@ -48,9 +48,14 @@ class Team:
         return (n - t + self.threads - 1) // self.threads
 
     @ti.func
+    def term(self, t, j):
+        """Return the j-th entry of thread t in a sum."""
+        return t + j * self.threads
+
+    @ti.func
     def entry(self, t, j, n):
-        """Return the j-th entry of thread t."""
-        at = t + j * self.threads
+        """Return the j-th of n entries that thread t takes."""
+        at = self.term(t, j)
         if ti.static(self.virtual > 1 or self.backwards):
             at = j
             if ti.static(self.backwards):
@@ -101,6 +106,9 @@ class Team:
             else:
                 result += self.sums[first + k]
         return result
+
+
+ALONE = Team()
 
 
 def make_team(arena: FieldArena, name: str) -> Team:

@@ -13,10 +13,9 @@ import numpy as np
 import scipy.sparse as sp
 import taichi as ti
 
-from taisoft.backend.lists import add_up_counts, clear_counts, count_entry, place_of_entry, sort_lists
+from taisoft.backend.lists import count_entry, place_of_entry
 from taisoft.backend.runtime import kernel
 from taisoft.contact.problem import ContactProblem, fill_field
-from taisoft.errors import SimulationError
 
 UNCOLOURED = -1
 BITS = 30  # colours tested at a time, as bits of an integer
@@ -94,50 +93,55 @@ def _first_free(problem: ti.template(), c):
     return result
 
 
-@kernel
-def _clear_colours(problem: ti.template()):
-    ti.loop_config(serialize=problem.serial)
-    for c in range(problem.count[0]):
-        problem.sweep.colour[c] = UNCOLOURED
-
-
-@kernel
-def _colour_round(problem: ti.template()) -> ti.i32:
-    """Colour contacts whose higher-priority neighbours are coloured (same round included, if visible). Return their number."""
-    coloured = 0
-    ti.loop_config(serialize=problem.serial)
-    for c in range(problem.count[0]):
-        if problem.sweep.colour[c] == UNCOLOURED:
-            problem.sweep.colour[c] = _first_free(problem, c)
-            if problem.sweep.colour[c] != UNCOLOURED:
-                coloured += 1
-    return coloured
-
-
-@kernel
-def _group(problem: ti.template()):
-    """Group the contacts by colour, in ascending order."""
+@ti.func
+def colour(problem: ti.template(), team: ti.template(), t):
+    """Colour and group the contacts, by all threads t of a team. A round colours those whose neighbours of higher priority are
+    coloured, in the same round if that is visible."""
     n = problem.count[0]
-    clear_counts(problem.sweep.by_colour, n)
-    problem.count[1] = 0
-    ti.loop_config(serialize=problem.sweep.by_colour.serial)
-    for c in range(n):
-        count_entry(problem.sweep.by_colour, problem.sweep.colour[c])
-        ti.atomic_max(problem.count[1], problem.sweep.colour[c] + 1)
-    add_up_counts(problem.sweep.by_colour, n)
-    ti.loop_config(serialize=problem.sweep.by_colour.serial)
-    for c in range(n):
-        problem.sweep.order[place_of_entry(problem.sweep.by_colour, problem.sweep.colour[c])] = c
-    sort_lists(problem.sweep.by_colour, problem.count[1], problem.sweep.order)
-
-
-def colour_contacts(problem: ContactProblem) -> None:
-    """Colour and group the contacts of a problem over nodes, once before the sweeps, after `index_nodes`."""
-    remaining = int(problem.count[0])
-    _clear_colours(problem)
-    while remaining:
-        coloured = int(_colour_round(problem))
-        if not coloured:
-            raise SimulationError(f"{remaining} contacts could not be coloured")
+    for j in range(team.share(t, n)):
+        problem.sweep.colour[team.entry(t, j, n)] = UNCOLOURED
+    team.sync()
+    remaining, coloured = ti.cast(n, ti.f64), ti.cast(1.0, ti.f64)
+    while remaining > 0.0 and coloured > 0.0:
+        found = ti.cast(0.0, ti.f64)
+        for j in range(team.share(t, n)):
+            c = team.entry(t, j, n)
+            if problem.sweep.colour[c] == UNCOLOURED:
+                problem.sweep.colour[c] = _first_free(problem, c)
+                found += ti.cast(problem.sweep.colour[c] != UNCOLOURED, ti.f64)
+        coloured = team.total(t, found)
         remaining -= coloured
-    _group(problem)
+    _group(problem, team, t, n)
+
+
+@ti.func
+def _group(problem: ti.template(), team: ti.template(), t, n):
+    """Group the contacts by colour. Their order within a colour may vary, and does not matter: they share no movable node."""
+    (start,) = ti.static((problem.sweep.by_colour.start,))
+    highest = ti.cast(-1.0, ti.f64)
+    for j in range(team.share(t, n)):
+        highest = ti.max(highest, ti.cast(problem.sweep.colour[team.term(t, j)], ti.f64))
+    n_colours = ti.cast(team.largest(t, highest), ti.i32) + 1
+    for j in range(team.share(t, n_colours + 2)):
+        start[team.entry(t, j, n_colours + 2)] = 0
+    team.sync()
+    for j in range(team.share(t, n)):
+        count_entry(problem.sweep.by_colour, problem.sweep.colour[team.entry(t, j, n)])
+    team.sync()
+    if t == 0:
+        problem.count[1] = n_colours
+        for k in range(1, n_colours + 2):
+            start[k] += start[k - 1]
+    team.sync()
+    for j in range(team.share(t, n)):
+        c = team.entry(t, j, n)
+        problem.sweep.order[place_of_entry(problem.sweep.by_colour, problem.sweep.colour[c])] = c
+    team.sync()
+
+
+@kernel
+def colour_contacts(problem: ti.template()):
+    """Colour and group the contacts of a problem over nodes, once before the sweeps, after `index_nodes`."""
+    ti.loop_config(serialize=problem.team.alone, block_dim=problem.team.threads)
+    for t in range(problem.team.threads):
+        colour(problem, problem.team, t)

@@ -347,6 +347,22 @@ def find_velocities(problem: ti.template()):
 
 
 @ti.func
+def set_velocities(problem: ti.template(), team: ti.template(), t):
+    """`update_velocities` by all threads t of a team."""
+    if ti.static(not problem.matrix and problem.serial):
+        update_velocities(problem)
+    elif ti.static(not problem.matrix):
+        n = problem.count[0]
+        for j in range(team.share(t, n)):
+            c = team.entry(t, j, n)
+            for e in range(problem.first[c], problem.first[c] + problem.arity[c]):
+                i = problem.node[e]
+                if problem.entry[problem.by_node.start[i]] == e:  # so that one contact sets it
+                    problem.w[i] = problem.inverse_mass[i] * impulse_on(problem, i)
+        team.sync()
+
+
+@ti.func
 def own_block(problem: ti.template(), c):
     """The 3x3 block of W between contact c and itself."""
     B = ti.Matrix.zero(ti.f64, 3, 3)

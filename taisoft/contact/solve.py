@@ -1,8 +1,9 @@
-"""Sweep until the residual is small: on one thread in one kernel, or in parallel loops.
+"""Sweep until the residual is small: by a team in one launch, or in parallel loops.
 
-On a CPU one thread is faster: it takes 0.06 us per contact and sweep. A parallel loop costs some 30 us to start, a sweep has two
-to twenty of them, and memory bandwidth limits two threads to little more than the speed of one.
-On one thread Gauss-Seidel leaves out, until the next residual check, the contacts that a check after the first finds open.
+On a CPU the team is one thread, which is faster: it takes 0.06 us per contact and sweep. A parallel loop costs some 30 us to
+start, a sweep has two to twenty of them, and memory bandwidth limits two threads to little more than the speed of one. On a GPU
+it is a block, since a launch for each colour takes longer than its contacts; only large problems use all threads.
+A team leaves out, until the next residual check, the contacts that a check after the first finds open.
 
 Nesterov momentum follows any kind of sweep. The next one starts from the extrapolated impulses
     y = prox(x + (t - 1)/t' (x - x_before)),   t' = (1 + sqrt(1 + 4 t^2)) / 2,
@@ -24,6 +25,7 @@ from dataclasses import dataclass, field
 import taichi as ti
 
 from taisoft.backend.runtime import kernel
+from taisoft.backend.team import ALONE, Team
 from taisoft.contact.problem import (
     AGE,
     BEST,
@@ -40,12 +42,13 @@ from taisoft.contact.problem import (
     find_velocities,
     natural_map,
     residual_of,
-    update_velocities,
+    set_velocities,
 )
 from taisoft.contact.prox import prox
 from taisoft.contact.sweeps import SIMULTANEOUS, relaxation, sweep, sweep_parallel
 
 LAUNCH_VISITS = 1_000_000  # contact visits per launch: about 0.1 s, so that Ctrl-C takes effect
+MOST_OF_TEAM = 30_000  # contacts from which all threads of a GPU share a sweep
 CHECK_EVERY = 5  # sweeps between residual checks, each of which costs as much as a sweep
 # Sums of powers of two: the same numbers in f32 and f64
 SHRINK = 0.75  # of the fraction when impulses are restored
@@ -81,100 +84,117 @@ def solve(
     max_iterations: sweeps. every: sweeps between residual checks. history: whether to return the residual of each check.
     momentum: False for the plain method.
     """
-    # Gauss-Seidel has no parallel form: it runs on one thread even if the problem has parallel loops
-    run = _run_serial if problem.serial or method == "gauss_seidel" else _run_parallel
-    batch = max(1, min(HISTORY - 1, LAUNCH_VISITS // max(1, int(problem.count[0])) // every)) * every
+    n_contacts = int(problem.count[0])
+    team, is_parallel = _team_of(problem, method, n_contacts)
+    batch = max(1, min(HISTORY - 1, LAUNCH_VISITS // max(1, n_contacts) // every)) * every
     remaining, first, residuals = max_iterations, 1, []
     while True:
         n = min(batch, remaining)
-        run(problem, method, first, n, every, tolerance, int(momentum))
-        remaining, first = remaining - n, 0
-        residual = float(problem.sweep.state[RESIDUAL])
-        if history:
-            residuals += problem.sweep.history.to_numpy(int(problem.sweep.state[CHECKS])).tolist()
-        if remaining == 0 or residual <= tolerance:
-            break
-    best = float(problem.sweep.state[BEST])
-    if best < residual or residual != residual:
-        _restore_best(problem)
-        find_velocities(problem)
-        residual = best
-    return SolveResult(int(problem.sweep.state[SWEEPS]), residual, residual <= tolerance, residuals)
-
-
-@kernel
-def _restore_best(problem: ti.template()):
-    """Replace the present impulses by the best ones."""
-    ti.loop_config(serialize=problem.serial)
-    for c in range(problem.count[0]):
-        problem.r[c] = problem.sweep.best[c]
-
-
-# --- loops: parallel at the top level of a kernel, serial in the loop of `_run_serial` -----------------------------------
-
-
-@ti.func
-def _prepare(problem: ti.template(), method: ti.template(), with_momentum):
-    """Set the fractions of the r-factors and the impulses before the first sweep."""
-    for c in range(problem.count[0]):
-        problem.sweep.relaxation[c] = relaxation(problem, c, method, with_momentum)
-        problem.sweep.previous[c] = problem.r[c]
-
-
-@ti.func
-def _sum_chunks(problem: ti.template(), chunks: ti.template()):
-    """Sum the terms of each chunk, in order."""
-    for k in range(chunks):
-        n, total = problem.count[0], ti.Vector([0.0, 0.0], ti.f64)
-        for c in range(k * n // chunks, (k + 1) * n // chunks):
-            total += problem.sweep.term[c]
-        problem.sweep.partial[k] = total
-
-
-@ti.func
-def _total(problem: ti.template(), chunks: ti.template()):
-    total = ti.Vector([0.0, 0.0], ti.f64)
-    for k in range(chunks):
-        total += problem.sweep.partial[k]
-    return total
-
-
-@ti.func
-def _check(problem: ti.template(), chunks: ti.template(), first, sweeps):
-    """Check the residual and save or restore the impulses; w must be up to date."""
-    for c in range(problem.count[0]):
-        problem.sweep.term[c] = natural_map(problem, c)
-        problem.sweep.idle[c] = int(first == 0 and (problem.sweep.term[c] == 0.0).all())
-    _sum_chunks(problem, chunks)
-    ti.loop_config(serialize=True)
-    for _ in range(1):
-        problem.sweep.state[RESIDUAL] = residual_of(_total(problem, chunks))
-        if first == 1:
-            _begin(problem)
+        if is_parallel:
+            _run_parallel(problem, method, first, n, every, tolerance, int(momentum))
         else:
-            _accept_or_reject(problem, sweeps)
-    for c in range(problem.count[0]):
-        _apply_verdict(problem, c)
+            _run(problem, team, method, first, n, every, tolerance, int(momentum))
+        remaining, first = remaining - n, 0
+        state = problem.sweep.state.to_numpy()
+        if history:
+            residuals += problem.sweep.history.to_numpy(int(state[CHECKS])).tolist()
+        if remaining == 0 or state[RESIDUAL] <= tolerance:
+            break
+    if not state[RESIDUAL] <= state[BEST]:
+        _restore_best(problem, team)
+        state[RESIDUAL] = state[BEST]
+    return SolveResult(int(state[SWEEPS]), float(state[RESIDUAL]), bool(state[RESIDUAL] <= tolerance), residuals)
+
+
+def _team_of(problem: ContactProblem, method: str, n_contacts: int) -> tuple[Team, bool]:
+    """Return the team for a problem of so many contacts, and whether all threads share its loops instead."""
+    if problem.serial or method == "gauss_seidel":  # which has no parallel form
+        return ALONE, False
+    return problem.team, problem.on_cpu or n_contacts > MOST_OF_TEAM
+
+
+# --- by a team ------------------------------------------------------------------------------------------------------------
 
 
 @ti.func
-def _extrapolate(problem: ti.template(), chunks: ti.template()):
+def sweeps_of_team(
+    problem: ti.template(), team: ti.template(), method: ti.template(), t, first, sweeps, every, tolerance, with_momentum
+):
+    """Run up to `sweeps` sweeps with a residual check after each `every`, by all threads t of a team.
+
+    first: 1 at the start of a solve; with_momentum: 0 or 1.
+    """
+    if t == 0:
+        problem.sweep.state[CHECKS] = 0.0
+    if first == 1:
+        set_velocities(problem, team, t)
+        for j in range(team.share(t, problem.count[0])):
+            _prepare(problem, team.entry(t, j, problem.count[0]), method, with_momentum)
+        _check(problem, team, t, 1, 0)
+    done = 0
+    while done < sweeps and not problem.sweep.state[RESIDUAL] <= tolerance:
+        n = ti.min(every, sweeps - done)
+        for _k in range(n):
+            sweep(problem, team, method, t)
+            if with_momentum == 1:
+                _extrapolate(problem, team, t)
+            set_velocities(problem, team, t)
+        done += n
+        _check(problem, team, t, 0, n)
+        if problem.sweep.state[RESIDUAL] == problem.sweep.state[BEST]:
+            set_velocities(problem, team, t)
+
+
+@ti.func
+def _check(problem: ti.template(), team: ti.template(), t, first, sweeps):
+    """Check the residual and save or restore the impulses; w must be up to date."""
+    n, sums = problem.count[0], ti.Vector([0.0, 0.0], ti.f64)
+    for j in range(team.share(t, n)):
+        sums += _residual_terms(problem, team.term(t, j), first)
+    for k in ti.static(range(2)):
+        sums[k] = team.total(t, sums[k])
+    if t == 0:
+        _judge(problem, sums, first, sweeps)
+    team.sync()
+    for j in range(team.share(t, n)):
+        _apply_verdict(problem, team.entry(t, j, n))
+    team.sync()
+
+
+@ti.func
+def _extrapolate(problem: ti.template(), team: ti.template(), t):
     """Set the impulses from which the next sweep starts."""
-    for c in range(problem.count[0]):
-        problem.sweep.term[c] = [_restart_test(problem, c), 0.0]
-    _sum_chunks(problem, chunks)
-    ti.loop_config(serialize=True)
-    for _ in range(1):
-        _set_weight(problem, _total(problem, chunks)[0])
-    for c in range(problem.count[0]):
-        x = problem.r[c]
-        problem.r[c] = prox(x + problem.sweep.state[WEIGHT] * (x - problem.sweep.previous[c]), problem.friction[c])
-        problem.sweep.previous[c] = x
+    n, backwards = problem.count[0], ti.cast(0.0, ti.f64)
+    for j in range(team.share(t, n)):
+        backwards += _restart_test(problem, team.term(t, j))
+    backwards = team.total(t, backwards)
+    if t == 0:
+        _set_weight(problem, backwards)
+    team.sync()
+    for j in range(team.share(t, n)):
+        _move_on(problem, team.entry(t, j, n))
+    team.sync()
+
+
+@ti.func
+def restore_best(problem: ti.template(), team: ti.template(), t):
+    """Replace the present impulses by the best ones, if these are better, at the end of a solve."""
+    residual, best = problem.sweep.state[RESIDUAL], problem.sweep.state[BEST]
+    team.sync()
+    if best < residual or residual != residual:
+        for j in range(team.share(t, problem.count[0])):
+            c = team.entry(t, j, problem.count[0])
+            problem.r[c] = problem.sweep.best[c]
+        if t == 0:
+            problem.sweep.state[RESIDUAL] = best
+        team.sync()
+        set_velocities(problem, team, t)
 
 
 @kernel
-def _run_serial(
+def _run(
     problem: ti.template(),
+    team: ti.template(),
     method: ti.template(),
     first: ti.i32,
     sweeps: ti.i32,
@@ -182,39 +202,35 @@ def _run_serial(
     tolerance: ti.f64,
     with_momentum: ti.i32,
 ):
-    """Run up to `sweeps` sweeps with a residual check after each `every`; first: 1 at the start of a solve."""
-    ti.loop_config(serialize=True)
-    for _ in range(1):
-        problem.sweep.state[CHECKS] = 0.0
-        if first == 1:
-            update_velocities(problem)
-            _prepare(problem, method, with_momentum)
-            _check(problem, 1, 1, 0)
-        done = 0
-        while done < sweeps and not problem.sweep.state[RESIDUAL] <= tolerance:
-            n = ti.min(every, sweeps - done)
-            for _k in range(n):
-                sweep(problem, method)
-                if with_momentum == 1:
-                    _extrapolate(problem, 1)
-                update_velocities(problem)
-            done += n
-            _check(problem, 1, 0, n)
-            if problem.sweep.state[RESIDUAL] == problem.sweep.state[BEST]:
-                update_velocities(problem)
+    """See `sweeps_of_team`."""
+    ti.loop_config(serialize=team.alone, block_dim=team.threads)
+    for t in range(team.threads):
+        sweeps_of_team(problem, team, method, t, first, sweeps, every, tolerance, with_momentum)
+
+
+@kernel
+def _restore_best(problem: ti.template(), team: ti.template()):
+    """See `restore_best`."""
+    ti.loop_config(serialize=team.alone, block_dim=team.threads)
+    for t in range(team.threads):
+        restore_best(problem, team, t)
+
+
+# --- on all threads -------------------------------------------------------------------------------------------------------
 
 
 def _run_parallel(
     problem: ContactProblem, method: str, first: int, sweeps: int, every: int, tolerance: float, with_momentum: int
 ) -> None:
-    """As `_run_serial`, on all threads; the host reads the residual."""
-    problem.sweep.state[CHECKS] = 0.0
+    """As `_run`; the host reads the residual."""
+    state = problem.sweep.state
+    state[CHECKS] = 0.0
     if first:
         find_velocities(problem)
         _prepare_all(problem, method, with_momentum)
         _check_all(problem, 1, 0)
-    done, n_colours = 0, 0 if method in SIMULTANEOUS else int(problem.count[1])
-    while done < sweeps and not problem.sweep.state[RESIDUAL] <= tolerance:
+    done, n_colours, found = 0, 0 if method in SIMULTANEOUS else int(problem.count[1]), state.to_numpy()
+    while done < sweeps and not found[RESIDUAL] <= tolerance:
         n = min(every, sweeps - done)
         for _ in range(n):
             sweep_parallel(problem, method, n_colours)
@@ -223,23 +239,85 @@ def _run_parallel(
             find_velocities(problem)
         done += n
         _check_all(problem, 0, n)
-        if problem.sweep.state[RESIDUAL] == problem.sweep.state[BEST]:
+        found = state.to_numpy()
+        if found[RESIDUAL] == found[BEST]:
             find_velocities(problem)
+
+
+@ti.func
+def _sum_chunks(problem: ti.template()):
+    """Sum the terms of each chunk, in order."""
+    for k in range(CHUNKS):
+        n, total = problem.count[0], ti.Vector([0.0, 0.0], ti.f64)
+        for c in range(k * n // CHUNKS, (k + 1) * n // CHUNKS):
+            total += problem.sweep.term[c]
+        problem.sweep.partial[k] = total
+
+
+@ti.func
+def _total(problem: ti.template()):
+    total = ti.Vector([0.0, 0.0], ti.f64)
+    for k in range(CHUNKS):
+        total += problem.sweep.partial[k]
+    return total
 
 
 @kernel
 def _prepare_all(problem: ti.template(), method: ti.template(), with_momentum: ti.i32):
-    _prepare(problem, method, with_momentum)
+    for c in range(problem.count[0]):
+        _prepare(problem, c, method, with_momentum)
 
 
 @kernel
 def _check_all(problem: ti.template(), first: ti.i32, sweeps: ti.i32):
-    _check(problem, CHUNKS, first, sweeps)
+    """As `_check`."""
+    for c in range(problem.count[0]):
+        problem.sweep.term[c] = _residual_terms(problem, c, first)
+    _sum_chunks(problem)
+    ti.loop_config(serialize=True)
+    for _ in range(1):
+        _judge(problem, _total(problem), first, sweeps)
+    for c in range(problem.count[0]):
+        _apply_verdict(problem, c)
 
 
 @kernel
 def _extrapolate_all(problem: ti.template()):
-    _extrapolate(problem, CHUNKS)
+    """As `_extrapolate`."""
+    for c in range(problem.count[0]):
+        problem.sweep.term[c] = [_restart_test(problem, c), 0.0]
+    _sum_chunks(problem)
+    ti.loop_config(serialize=True)
+    for _ in range(1):
+        _set_weight(problem, _total(problem)[0])
+    for c in range(problem.count[0]):
+        _move_on(problem, c)
+
+
+# --- of one contact -------------------------------------------------------------------------------------------------------
+
+
+@ti.func
+def _prepare(problem: ti.template(), c, method: ti.template(), with_momentum):
+    """Set the fraction of the r-factors and the impulse of contact c before the first sweep."""
+    problem.sweep.relaxation[c] = relaxation(problem, c, method, with_momentum)
+    problem.sweep.previous[c] = problem.r[c]
+
+
+@ti.func
+def _residual_terms(problem: ti.template(), c, first):
+    """`natural_map` of contact c; find out whether it is idle, unless it is the first check."""
+    found = natural_map(problem, c)
+    problem.sweep.idle[c] = int(first == 0 and (found == 0.0).all())
+    return found
+
+
+@ti.func
+def _move_on(problem: ti.template(), c):
+    """Extrapolate the impulse of contact c by the weight."""
+    x = problem.r[c]
+    problem.r[c] = prox(x + problem.sweep.state[WEIGHT] * (x - problem.sweep.previous[c]), problem.friction[c])
+    problem.sweep.previous[c] = x
 
 
 # --- momentum ---------------------------------------------------------------------------------------------------------
@@ -266,6 +344,16 @@ def _set_weight(problem: ti.template(), total):
 
 
 # --- r-factor strategy ------------------------------------------------------------------------------------------------
+
+
+@ti.func
+def _judge(problem: ti.template(), sums, first, sweeps):
+    """Set the residual and the verdict from the sums of `natural_map` over the contacts."""
+    problem.sweep.state[RESIDUAL] = residual_of(sums)
+    if first == 1:
+        _begin(problem)
+    else:
+        _accept_or_reject(problem, sweeps)
 
 
 @ti.func

@@ -31,30 +31,46 @@ BATCH = 4  # colours per launch: a launch costs more than a loop in it
 
 
 @ti.func
-def sweep(problem: ti.template(), method: ti.template()):
-    """Relax every contact once; leave the old impulses in `sweep_start`. Called at a kernel's top level, with a method of
-    SIMULTANEOUS only, its loops are parallel."""
+def sweep(problem: ti.template(), team: ti.template(), method: ti.template(), t):
+    """Relax every contact once, by all threads t of a team, one of them for gauss_seidel; leave the old impulses in
+    `sweep_start`."""
+    n = problem.count[0]
     if ti.static(method in SIMULTANEOUS):
-        for c in range(problem.count[0]):
+        for j in range(team.share(t, n)):
+            c = team.entry(t, j, n)
             problem.sweep.sweep_start[c] = _relaxed(problem, c, method)
-        for c in range(problem.count[0]):
-            _swap(problem, c)
+        team.sync()
+        for j in range(team.share(t, n)):
+            _swap(problem, team.entry(t, j, n))
+        team.sync()
+    elif ti.static(method == "gauss_seidel"):
+        for k in range(n):
+            _relax_active(problem, problem.sweep.order[k])
     else:
-        for k in range(problem.count[0]):
-            c = problem.sweep.order[k]
-            if problem.sweep.idle[c] == 1:
-                problem.sweep.sweep_start[c] = problem.r[c]
-            else:
-                _relax(problem, c)
+        for colour in range(problem.count[1]):
+            first = problem.sweep.by_colour.start[colour]
+            size = problem.sweep.by_colour.start[colour + 1] - first
+            for j in range(team.share(t, size)):
+                _relax_active(problem, problem.sweep.order[first + team.entry(t, j, size)])
+            team.sync()
 
 
 def sweep_parallel(problem: ContactProblem, method: str, n_colours: int) -> None:
-    """As `sweep`, on all threads, for any method but gauss_seidel."""
+    """As `sweep`, on all threads of the CPU or of a GPU, for any method but gauss_seidel."""
     if method in SIMULTANEOUS:
         _relax_all(problem, method)
     else:
         for first in range(0, n_colours, BATCH):
             _relax_colours(problem, first)
+
+
+@ti.func
+def _relax_active(problem: ti.template(), c):
+    """`_relax` contact c, unless it was open at the last residual check."""
+    if problem.sweep.idle[c] == 1:
+        problem.sweep.sweep_start[c] = problem.r[c]
+    else:
+        _relax(problem, c)
 
 
 @ti.func
@@ -96,7 +112,10 @@ def _swap(problem: ti.template(), c):
 
 @kernel
 def _relax_all(problem: ti.template(), method: ti.template()):
-    sweep(problem, method)
+    for c in range(problem.count[0]):
+        problem.sweep.sweep_start[c] = _relaxed(problem, c, method)
+    for c in range(problem.count[0]):
+        _swap(problem, c)
 
 
 @kernel

@@ -228,7 +228,7 @@ def sum_residual(contacts: ti.template(), t):
     rows, work = ti.static((contacts.problem, contacts.work))
     sums, worst = ti.Vector([0.0, 0.0], ti.f64), ti.cast(0.0, ti.f64)
     for j in range(rows.team.share(t, rows.count[0])):
-        one = work.prox_residual[rows.team.entry(t, j, rows.count[0])]
+        one = work.prox_residual[rows.team.term(t, j)]
         sums += ti.Vector([one[0], one[1]], ti.f64)
         worst = ti.max(worst, one[2])
     for j in ti.static(range(2)):

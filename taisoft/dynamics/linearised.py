@@ -66,7 +66,7 @@ def _slope(contacts: ti.template(), linear_slope, curvature, a, r_scale, t):
     if t > 0:
         slope = 0.0
     for j in range(rows.team.share(t, rows.count[0])):
-        c = rows.team.entry(t, j, rows.count[0])
+        c = rows.team.term(t, j)
         z = unprojected_impulse(contacts, c, work.velocity[c] + a * work.rate[c], r_scale)
         slope -= work.rate[c].dot(projected_impulse(contacts, c, z))
     return rows.team.total(t, slope)
@@ -106,7 +106,7 @@ def _find_step_length(m: ti.template(), contacts: ti.template(), r_scale, t):
     if t > 0:
         linear_slope = 0.0
     for j in range(rows.team.share(t, rows.count[0])):
-        c = rows.team.entry(t, j, rows.count[0])
+        c = rows.team.term(t, j)
         linear_slope += work.rate[c].dot(rows.r[c])
     linear_slope = rows.team.total(t, linear_slope)
     length = _root(contacts, linear_slope, total(m, OTHER_SUM), start, r_scale, t)
