@@ -68,6 +68,12 @@ def clear_counts(lists: ti.template(), n_keys):
 
 
 @ti.func
+def keys_if(go, n_keys):
+    """Return the number of keys with which these loops do nothing if go is 0, n_keys if it is 1."""
+    return go * (n_keys + 2) - 2
+
+
+@ti.func
 def count_entry(lists: ti.template(), key):
     """Count an entry of a key."""
     ti.atomic_add(lists.start[key + 2], 1)

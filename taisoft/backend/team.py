@@ -85,16 +85,35 @@ class Team:
         return self._folded(t, value, True)
 
     @ti.func
+    def before(self, t, value):
+        """Return the sum of an f64 value over the threads before t."""
+        result = ti.cast(0.0, ti.f64)
+        if ti.static(not self.alone):
+            self._store(t, value, False)
+            size = ti.static(self.threads // FOLD)
+            for k in range(t // size):
+                result += self.sums[self.threads + k]
+            for k in range(t - t % size, t):
+                result += self.sums[k]
+            self.sync()
+        return result
+
+    @ti.func
     def _folded(self, t, value, largest: ti.template()):
         result = value
         if ti.static(not self.alone):
-            self.sums[t] = value
-            self.sync()
-            if t < FOLD:
-                self.sums[self.threads + t] = self._fold(t * (self.threads // FOLD), self.threads // FOLD, largest)
-            self.sync()
+            self._store(t, value, largest)
             result = self._fold(self.threads, FOLD, largest)
         return result
+
+    @ti.func
+    def _store(self, t, value, largest: ti.template()):
+        """Store each thread's value, and what FOLD parts of them give."""
+        self.sums[t] = value
+        self.sync()
+        if t < FOLD:
+            self.sums[self.threads + t] = self._fold(t * (self.threads // FOLD), self.threads // FOLD, largest)
+        self.sync()
 
     @ti.func
     def _fold(self, first, n: ti.template(), largest: ti.template()):

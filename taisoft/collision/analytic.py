@@ -231,12 +231,9 @@ def _obstacle_contacts(s: ti.template(), o: ti.template(), t, k, margin, out: ti
     return at
 
 
-@kernel(cse=False)
-def find_analytic(s: ti.template(), o: ti.template(), margin: ti.f64, out: ti.template(), append: ti.i32):
-    """Write contacts of the soft bodies' triangles with all analytic obstacles that these are not attached to, unless both rest.
-
-    They are appended if `append` is 1.
-    """
+@ti.func
+def write_analytic(s: ti.template(), o: ti.template(), margin, out: ti.template(), append):
+    """See `find_analytic`. Top-level loops of a kernel."""
     ti.loop_config(serialize=s.serial)
     for task in range(s.chunks * s.spread):
         if task % s.spread == 0:
@@ -254,3 +251,12 @@ def find_analytic(s: ti.template(), o: ti.template(), margin: ti.f64, out: ti.te
                             at = _obstacle_contacts(s, o, t, k, margin, out.data, at, end)
             out.used[c] = at - c * out.part
     sum_parts(out)
+
+
+@kernel(cse=False)
+def find_analytic(s: ti.template(), o: ti.template(), margin: ti.f64, out: ti.template(), append: ti.i32):
+    """Write contacts of the soft bodies' triangles with all analytic obstacles that these are not attached to, unless both rest.
+
+    They are appended if `append` is 1.
+    """
+    write_analytic(s, o, margin, out, append)

@@ -27,7 +27,8 @@ from taisoft.collision.near_list import STILL
 from taisoft.collision.overlay import build_overlay, overlay_points
 from taisoft.collision.passages import append_passages
 from taisoft.collision.path_check import IN_BOXES, NO_PASSAGES, HeldPassages, PathCheck
-from taisoft.collision.reduction import Reduction
+from taisoft.collision.reduction import Reduction, ReductionFields
+from taisoft.collision.shape_search import search_shapes
 from taisoft.collision.spatial_hash import SpatialHash
 from taisoft.collision.surface import ACTIVE, NONFINITE, PAIRS, build_surface, update_surface
 from taisoft.errors import SceneError, SimulationError, reworded
@@ -174,28 +175,59 @@ class Detection:
         contacts. none_cross: whether no surfaces are known to cross here.
         Raise SimulationError if positions are not finite, or if a buffer would outgrow its limit.
         """
-        self._move(time, dt, prescribed, path)
-        self._broad_result = self._near()
-        if self.overlay is not None and none_cross != self._none_cross:
-            self._none_cross, self.overlay.behind[0] = none_cross, self.floor if none_cross else np.inf
-        fill(lambda: self._fill_buffer(self._broad_result, held), *self._scratch(), self.buffer)
-        self._reduction.reduce(-self.floor if none_cross else -np.inf)  # if none cross, a vertex behind a face is not inside
+        if self.only_shapes and not len(held.pairs):
+            motion = self._motion(time, dt, prescribed, path)
+            fill(lambda: self.search_shapes(motion, none_cross), self.buffer)
+            self._refuse_nonfinite()
+            self._reduction.read()
+        else:
+            self._move(time, dt, prescribed, path)
+            self._broad_result = self._near()
+            if self.overlay is not None and none_cross != self._none_cross:
+                self._none_cross, self.overlay.behind[0] = none_cross, self.floor if none_cross else np.inf
+            fill(lambda: self._fill_buffer(self._broad_result, held), *self._scratch(), self.buffer)
+            self._reduction.reduce(self._lowest_gap(none_cross))
         self._count()
 
-    def _move(self, time: float, dt: float, prescribed=None, path=None, x=None) -> None:
-        """Update positions and displacements of the surface, and the boxes. x: the nodes' positions if not the present ones."""
-        s, m = self.surface, self.model
+    def _lowest_gap(self, none_cross: bool) -> float:
+        """Gap [m] below which contacts are dropped: if none cross, a vertex behind a face is not inside."""
+        return -self.floor if none_cross else -np.inf
+
+    @property
+    def only_shapes(self) -> bool:
+        """Whether only analytic obstacles can be touched."""
+        return not self.has_pairs and self.shapes.any
+
+    def search_shapes(self, motion: tuple, none_cross: bool, room: int = 0, event: int = 0) -> None:
+        """Launch `search_shapes`, in scenes with `only_shapes`. motion: of `_motion`; room, event: as there."""
+        reduction = self._reduction
+        x, *others = motion
+        search = self.margin, self.buffer.parts, reduction.prepare(), *reduction.scales, self._lowest_gap(none_cross)
+        search_shapes(self.surface, self.shapes, x, *others, self.reach, *search, room, event)
+
+    def _motion(self, time: float, dt: float, prescribed=None, path=None, x=None) -> tuple:
+        """Place the obstacles; return what else moves the surface, see `update_surface`: x, v, whether vertices are prescribed,
+        these, and dt. x: the nodes' positions if not the present ones."""
+        m = self.model
         with reworded(SceneError, raised=SimulationError):
             self._place_obstacles(time, dt)
         has_prescribed = prescribed is not None and len(prescribed[0]) > 0
         if has_prescribed:
             if self._prescribed_moves is None:
-                self._prescribed_moves = self._arena.vectors("surface_prescribed", ti.f64, s.n_verts)
+                self._prescribed_moves = self._arena.vectors("surface_prescribed", ti.f64, self.surface.n_verts)
             self._prescribed_moves.from_numpy(prescribed_vertices(self.topology, *prescribed))
+        moves = self._prescribed_moves if has_prescribed else self.surface.move
         v, span = (m.state.v, dt) if path is None else (path, 1.0)
-        moves = self._prescribed_moves if has_prescribed else s.move
-        update_surface(s, m.state.x if x is None else x, v, has_prescribed, moves, span, self.reach, self.has_pairs)
-        if s.count[NONFINITE]:
+        return m.state.x if x is None else x, v, has_prescribed, moves, span
+
+    def _move(self, time: float, dt: float, prescribed=None, path=None, x=None) -> None:
+        """Update positions and displacements of the surface, and the boxes; the arguments are those of `_motion`."""
+        update_surface(self.surface, *self._motion(time, dt, prescribed, path, x), self.reach, self.has_pairs)
+        self._refuse_nonfinite()
+
+    def _refuse_nonfinite(self) -> None:
+        """Raise SimulationError if positions are not finite."""
+        if self.surface.count[NONFINITE]:
             raise SimulationError(self._nonfinite())
 
     def _place_obstacles(self, time: float, dt: float) -> None:
@@ -317,6 +349,11 @@ class Detection:
     def found(self) -> tuple:
         """The contacts of the last search, for kernels: surface, shapes, buffer, and the indices there of those that are kept."""
         return self.surface, self.shapes, self.buffer.data, self.kept
+
+    @property
+    def reduction(self) -> ReductionFields:
+        """The workspace of the last search's reduction."""
+        return self._reduction.work
 
     @property
     def kept(self):

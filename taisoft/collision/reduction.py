@@ -22,11 +22,13 @@ from taisoft.backend.lists import (
     clear_counts,
     count_entry,
     make_lists,
+    part_first,
     place_of_entry,
     sum_before,
 )
 from taisoft.backend.runtime import kernel
-from taisoft.collision.candidates import TOTAL, Buffer, Parts
+from taisoft.backend.team import Team, make_team
+from taisoft.collision.candidates import NEEDED, TOTAL, Buffer, Parts
 from taisoft.collision.contacts import EDGE_EDGE, FACE_FACE, MORTAR, VERTEX_FACE
 from taisoft.collision.surface import Surface, cell_of, ivec
 
@@ -44,6 +46,7 @@ class ReductionFields:
     spread: int  # as of the surface
     place: Any  # (capacity) i32: buffer index of the i-th contact found
     bucket: Any  # (capacity) i32: bucket of the i-th contact
+    team: Team
     lists: Lists  # of the buckets, in `member`
     member: Any  # (capacity) i32: buffer indices, by bucket
     state: Any  # (capacity) i32: state of the contact at each buffer index
@@ -56,7 +59,8 @@ def reduction_fields(arena: FieldArena, capacity: int, serial: bool, spread: int
     buckets = 1 << max(capacity - 1, 63).bit_length()  # the number in use grows with the number of contacts
     sizes = dict.fromkeys(("place", "bucket", "member", "state", "kept"), capacity) | {"count": 4}
     fields = {name: arena.field(f"reduction_{name}", ti.i32, size) for name, size in sizes.items()}
-    return ReductionFields(serial, spread, lists=make_lists(arena, "reduction", buckets, serial), **fields)
+    team, lists = make_team(arena, "reduction"), make_lists(arena, "reduction", buckets, serial)
+    return ReductionFields(serial, spread, team=team, lists=lists, **fields)
 
 
 @ti.func
@@ -73,10 +77,12 @@ def _fill_cells(work: ti.template(), out: ti.template(), inverse, lowest_gap):
         while mask + 1 < out.count[TOTAL]:
             mask = 2 * mask + 1
         work.count[FOUND], work.count[MASK] = out.count[TOTAL], mask
+        if out.count[NEEDED] > out.part:  # a truncated list is never used
+            work.count[FOUND] = 0
     clear_counts(work.lists, work.count[MASK] + 1)
     ti.loop_config(serialize=work.serial)
     for task in range(out.chunks * work.spread):
-        if task % work.spread == 0:
+        if task % work.spread == 0 and work.count[FOUND] > 0:
             c = task // work.spread
             first = sum_before(out.used, c)
             for k in range(out.used[c]):
@@ -143,62 +149,88 @@ def _decide(work: ti.template(), out: ti.template(), at, inverse, tolerance):
 
 
 @ti.func
-def _decide_all(work: ti.template(), out: ti.template(), inverse, tolerance):
-    """Run one round: decide every contact that can be decided."""
-    work.count[UNDECIDED] = 0
-    ti.loop_config(serialize=work.serial)
-    for i in range(work.count[FOUND]):
-        at = work.place[i]
-        if work.state[at] == UNKNOWN:
-            state = _decide(work, out, at, inverse, tolerance)
-            if state == UNKNOWN:
-                ti.atomic_add(work.count[UNDECIDED], 1)
-            else:
-                work.state[at] = state
+def _try(work: ti.template(), out: ti.template(), at, inverse, tolerance):
+    """Decide the contact at a buffer index, if it is undecided and can be decided. Return 1 if it stays undecided."""
+    undecided = 0
+    if work.state[at] == UNKNOWN:
+        state = _decide(work, out, at, inverse, tolerance)
+        if state == UNKNOWN:
+            undecided = 1
+        else:
+            work.state[at] = state
+    return undecided
 
 
 @ti.func
-def _list_kept(work: ti.template()):
-    """List the kept contacts in order, once all are decided."""
-    ti.loop_config(serialize=True)
-    for _ in range(1):
-        n = 0
-        if work.count[UNDECIDED] == 0:
-            for i in range(work.count[FOUND]):
-                if work.state[work.place[i]] == KEPT:
-                    work.kept[n] = work.place[i]
-                    n += 1
+def _decide_rest(work: ti.template(), out: ti.template(), inverse, tolerance, t):
+    """Run further rounds until all contacts are decided, by all threads t of the team."""
+    (team,) = ti.static((work.team,))
+    n, left = work.count[FOUND], ti.cast(work.count[UNDECIDED], ti.f64)
+    while left > 0.0:
+        left = 0.0
+        for j in range(team.share(t, n)):
+            left += ti.cast(_try(work, out, work.place[team.entry(t, j, n)], inverse, tolerance), ti.f64)
+        left = team.total(t, left)
+
+
+@ti.func
+def _list_kept(work: ti.template(), t):
+    """List the kept contacts in order, by all threads t of the team."""
+    threads = ti.static(work.team.threads)
+    first, last, n = part_first(t, work.count[FOUND], threads), part_first(t + 1, work.count[FOUND], threads), 0
+    if ti.static(not work.team.alone):
+        for i in range(first, last):
+            n += int(work.state[work.place[i]] == KEPT)
+        n = ti.cast(work.team.before(t, ti.cast(n, ti.f64)), ti.i32)
+    for i in range(first, last):
+        if work.state[work.place[i]] == KEPT:
+            work.kept[n] = work.place[i]
+            n += 1
+    if t == threads - 1:
         work.count[LEFT] = n
 
 
-@kernel
-def begin_reduction(work: ti.template(), out: ti.template(), inverse: ti.f64, tolerance: ti.f64, lowest_gap: ti.f64):
-    """Enter the contacts into the cells and run the first round; more are needed only while contacts are undecided."""
+@ti.func
+def reduce_all(work: ti.template(), out: ti.template(), inverse, tolerance, lowest_gap):
+    """Enter the contacts into the cells, decide which are kept, and list these, as top-level loops of a kernel.
+
+    inverse: of the cells' edge [1/m]; tolerance, lowest_gap [m].
+    """
     _fill_cells(work, out, inverse, lowest_gap)
-    _decide_all(work, out.data, inverse, tolerance)
-    _list_kept(work)
+    work.count[UNDECIDED] = 0
+    ti.loop_config(serialize=work.serial)
+    for i in range(work.count[FOUND]):
+        if _try(work, out.data, work.place[i], inverse, tolerance) == 1:
+            ti.atomic_add(work.count[UNDECIDED], 1)
+    ti.loop_config(serialize=work.team.alone, block_dim=work.team.threads)
+    for t in range(work.team.threads):
+        _decide_rest(work, out.data, inverse, tolerance, t)
+        _list_kept(work, t)
 
 
 @kernel
-def decide(work: ti.template(), out: ti.template(), inverse: ti.f64, tolerance: ti.f64):
-    """Run a further round."""
-    _decide_all(work, out.data, inverse, tolerance)
-    _list_kept(work)
+def run_reduction(work: ti.template(), out: ti.template(), inverse: ti.f64, tolerance: ti.f64, lowest_gap: ti.f64):
+    """See `reduce_all`."""
+    reduce_all(work, out, inverse, tolerance, lowest_gap)
+
+
+def inverse_cell(tolerance: float, cell: float) -> float:
+    """Inverse of the edge of the cells [1/m], which is at least 2.5 tolerances."""
+    return 1.0 / max(cell, 2.5 * tolerance)
 
 
 def reduce_contacts(work: ReductionFields, out: Parts, tolerance: float, cell: float, lowest_gap: float = -np.inf) -> None:
     """Fill work.kept and work.count for a buffer of contacts.
 
-    tolerance [m]; cell: edge of the cells [m], at least 2.5 tolerances; lowest_gap [m]: of surfaces that do not cross.
+    tolerance [m]; cell: edge of the cells [m]; lowest_gap [m]: of surfaces that do not cross.
     """
-    inverse = 1.0 / max(cell, 2.5 * tolerance)
-    begin_reduction(work, out, inverse, tolerance, lowest_gap)
-    while work.count[UNDECIDED] > 0:
-        decide(work, out, inverse, tolerance)
+    run_reduction(work, out, inverse_cell(tolerance, cell), tolerance, lowest_gap)
 
 
 class Reduction:
     """The reduction of one buffer of contacts, whose workspace grows with it. tolerance, cell [m]: as of `reduce_contacts`."""
+
+    n_found = n_kept = 0  # contacts before and after it
 
     def __init__(self, surface: Surface, buffer: Buffer, tolerance: float, cell: float):
         self._surface, self._buffer, self._lengths = surface, buffer, (tolerance, cell)
@@ -206,23 +238,28 @@ class Reduction:
 
     def reduce(self, lowest_gap: float) -> None:
         """Reduce the contacts in the buffer. lowest_gap [m]: of surfaces that do not cross."""
+        reduce_contacts(self.prepare(), self._buffer.parts, *self._lengths, lowest_gap)
+        self.read()
+
+    @property
+    def scales(self) -> tuple[float, float]:
+        """Inverse edge of the cells [1/m] and tolerance [m], for kernels."""
+        tolerance, cell = self._lengths
+        return inverse_cell(tolerance, cell), tolerance
+
+    def prepare(self) -> ReductionFields:
+        """Return the workspace, with room for all contacts that fit into the buffer."""
         surface, buffer = self._surface, self._buffer
         if self.work is None or self.work.place.shape[0] != buffer.capacity:
             arena = FieldArena()
             self.work = reduction_fields(arena, buffer.capacity, surface.serial_cheap, surface.cheap_spread)
             self._arena.release()
             self._arena = arena
-        reduce_contacts(self.work, buffer.parts, *self._lengths, lowest_gap)
+        return self.work
 
-    @property
-    def n_found(self) -> int:
-        """Contacts before the reduction."""
-        return self.work.count[FOUND]
-
-    @property
-    def n_kept(self) -> int:
-        """Contacts after it."""
-        return self.work.count[LEFT]
+    def read(self) -> None:
+        """Read the numbers of contacts."""
+        self.n_found, self.n_kept = self.work.count.to_numpy(2).tolist()
 
     @property
     def bytes(self) -> dict[str, int]:

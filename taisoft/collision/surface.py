@@ -25,6 +25,7 @@ TRIANGLE_SECONDS, CHEAP_SECONDS = 1e-7, 5e-9
 NOT_FINITE = 0x7FF  # exponent bits of infinite f64 numbers and of those that are no numbers
 CPU_CHUNKS, GPU_CHUNKS = 64, 4096  # chunks of a list that are processed in parallel, each with its own part of a buffer
 NONFINITE, ACTIVE, PAIRS = 0, 1, 2  # indices into Surface.count
+GO, EVENT = 0, 1  # indices into Surface.run
 INSIDE_BITS = 31  # of Surface.inside; one vertex is almost never inside two colliders with the same bit
 
 dvec = ti.types.vector(3, ti.f64)
@@ -72,6 +73,7 @@ class Surface:
     active: Any  # i32: triangles whose box meets another collider's, ascending; the first count[ACTIVE] are valid
     active_of_chunk: Any  # i32: the same, those of each chunk from its first triangle on
     count: Any  # (4) i32: numbers of NONFINITE and ACTIVE triangles, and of (query, nearby triangle) PAIRS
+    run: Any  # (2) i32: 1, or 0 once a batch of sub-steps has ended early; the event that has ended it, see `explicit_batch`
     part: Any  # (chunks) i32: count of each chunk
     near: Any  # (chunks * n_bodies) i32: colliders near each chunk's current collider
     sharp: Any  # (n_triangles) i32: edge bits, see `mark_sharp_edges`
@@ -114,6 +116,7 @@ def build_surface(
     vectors |= dict.fromkeys(("body_lo", "body_hi"), bodies)
     zeros = {"active": n, "active_of_chunk": n, "count": 4, "part": chunks, "near": chunks * bodies, "sharp": n, "inside": v}
     zeros |= {"rests": bodies}
+    run = arena.field("surface_run", ti.i32, 2, np.array([1, 0]))
     # triangles are rows, not vectors: the compiler confuses run-time and fixed component indices within one kernel
     fields = {name: integers(arena, f"surface_{name}", data) for name, data in tables.items()}
     fields |= {name: arena.vectors(f"surface_{name}", ti.f64, max(count, 1)) for name, count in vectors.items()}
@@ -137,6 +140,7 @@ def build_surface(
         area=arena.field("surface_area", ti.f64, max(n, 1)),
         exit_direction=arena.vectors("surface_exit_direction", ti.f64, max(v, 1)),
         **fields,
+        run=run,
     )
 
 
@@ -184,9 +188,10 @@ def may_touch(s: ti.template(), t, u):
 def _move_soft(
     s: ti.template(), x: ti.template(), v: ti.template(), has_prescribed: ti.template(), prescribed: ti.template(), dt
 ):
-    """Set positions and displacements of the soft bodies: prescribed ones where given, else v dt."""
+    """Set positions and displacements of the soft bodies: prescribed ones where given, else v dt. They stay as they are in a
+    batch that has ended."""
     ti.loop_config(serialize=s.serial_cheap)
-    for i in range(s.n_verts):
+    for i in range(s.run[GO] * s.n_verts):
         if s.node[i] >= 0:
             s.x[i] = x[s.node[i]]
             move = dt * ti.cast(v[s.node[i]], ti.f64)
@@ -334,6 +339,15 @@ def update_boxes(s: ti.template(), margin: ti.f64):
     _list_active(s)
 
 
+@ti.func
+def move_surface(
+    s: ti.template(), x: ti.template(), v: ti.template(), has_prescribed: ti.template(), prescribed: ti.template(), dt, margin
+):
+    """See `update_surface`. Top-level loops of a kernel."""
+    _move_soft(s, x, v, has_prescribed, prescribed, dt)
+    box_triangles(s, margin)
+
+
 @kernel
 def update_surface(
     s: ti.template(),
@@ -350,8 +364,7 @@ def update_surface(
     prescribed: (n_verts) 3-vectors, displacements [m], nan where free, read if has_prescribed. active: whether to list the
     active triangles too.
     """
-    _move_soft(s, x, v, has_prescribed, prescribed, dt)
-    box_triangles(s, margin)
+    move_surface(s, x, v, has_prescribed, prescribed, dt, margin)
     if ti.static(active):
         _box_bodies(s)
         _list_active(s)

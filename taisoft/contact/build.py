@@ -1,15 +1,6 @@
 """Build the contact problem from detected contacts: frames, weights, friction and restitution, warm start.
 
-The target is the smallest gap that a contact may have at the end of a step. It is at most the contact offset, a distance that
-keeps surfaces apart despite the error of linearising the motion. A gap above the offset may close to it. A gap below it opens
-slowly, but in implicit steps at once to LEAST_GAP of it; a true penetration opens within a few steps. Neither is faster than
-strains the softest body by one percent: bodies would fly apart otherwise. What touches without a load stays where it is: let w be
-the velocity at which sides approach plus that at which the pair's last impulses moved its contacts. While w dt is below STILL of
-the offset, gaps above minus the offset open no faster than PRESSED w. Contacts of a body with itself have SELF_CONTACT times the
-contact offset and are corrected SELF_CONTACT times as fast. Where the surfaces meet within the step, restitution raises the
-target (`restitution`). The impulse must satisfy
-    u_n = (gap - target)/dt + n.(v_a - v_b) >= 0,
-which counts motion once, since the gap is the one at the start of the step.
+Targets are in `targets`, what is known of the contacts of the previous step in `past`.
 """
 
 from dataclasses import dataclass
@@ -19,23 +10,19 @@ import numpy as np
 import taichi as ti
 
 from taisoft.backend.arrays import FieldArena
-from taisoft.backend.lists import add_up_counts, bucket_of, clear_counts, count_entries
+from taisoft.backend.lists import add_up_counts, clear_counts, count_entries, keys_if
 from taisoft.backend.runtime import kernel
-from taisoft.contact.problem import NODES, fill_field, to_frame, to_world
+from taisoft.collision.reduction import LEFT
+from taisoft.collision.surface import GO
+from taisoft.contact.past import keep_impulses, load_of, warm_impulse
+from taisoft.contact.problem import NODES, fill_field, list_entries, to_frame
 from taisoft.contact.prox import OPEN, SLIP, dvec, prox, scaled, state_of, tangent
+from taisoft.contact.targets import STILL, contact_offset_of
 from taisoft.fem.model import Model
 from taisoft.scene.scene import Scene
 
 NEGLIGIBLE = 1e-12  # a node with a smaller weight is left out of the contact
 VANISHING = 1e-9  # a contact with smaller weights alone is rounding: its sides move as one
-# Of the contact offset: in an implicit step a smaller gap opens to it at once, before surfaces that turn can cross. In the far
-# shorter explicit steps that would be a hop.
-LEAST_GAP = 0.1
-STILL = 0.002  # of the contact offset: surfaces that approach less in a step are at rest
-# Below 1, since a gap that opens causes impulses, too: without a load they must fall from step to step, also in a row of bodies
-PRESSED = 0.1
-GUARD = 0.5  # factor of the contact offset for contacts beside mortar contacts: room for what a mean leaves uneven
-SELF_CONTACT = 5.0  # factor of contact offset and correction rate in contacts of a body with itself: folds turn as they meet
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,100 +143,6 @@ def _add_vertex(p: ti.template(), m: ti.template(), s: ti.template(), c, k, v, w
 
 
 @ti.func
-def pair_slot(problem: ti.template(), body):
-    """Slot of a pair of colliders among those of the previous step, or the empty one where it belongs."""
-    mask, found = problem.past.n_slots - 1, 0
-    k = bucket_of(body[0], body[1], 0, mask)
-    while found == 0 and problem.past.pair_slot[k] >= 0:
-        if (problem.past.collider[problem.past.pair_slot[k]] == body).all():
-            found = 1
-        else:
-            k = (k + 1) & mask
-    return k
-
-
-@ti.func
-def _slot(problem: ti.template(), feature):
-    return bucket_of(feature[0], feature[1], feature[2], problem.past.n_slots - 1)
-
-
-@ti.func
-def _count_load(p: ti.template(), c, common_offset):
-    """Add contact c to the sums of its pair, if it carries an impulse or could be opened."""
-    if p.r[c][0] > 0.0 or p.gap[c] < contact_offset_of(p, c, common_offset):
-        k = pair_slot(p, p.body[c])
-        if p.past.pair_slot[k] < 0:
-            p.past.pair_slot[k] = c
-        first = p.past.pair_slot[k]
-        p.past.pair_sum[first] = p.past.pair_sum[first] + ti.Vector([p.r[c][0], p.factor[c][0]], ti.f64)
-
-
-@ti.func
-def _load(p: ti.template(), c):
-    """Velocity that the impulses of the pair of contact c gave its contacts in the previous step [m/s]."""
-    first, load = p.past.pair_slot[pair_slot(p, p.body[c])], ti.cast(0.0, ti.f64)
-    if first >= 0:
-        if p.past.pair_sum[first][1] > 0.0:
-            load = p.past.pair_sum[first][0] / p.past.pair_sum[first][1]
-    return load
-
-
-@ti.func
-def enter_past(problem: ti.template()):
-    """Store the present contacts as those of the past. Top-level loops of a kernel."""
-    ti.loop_config(serialize=problem.serial)
-    for c in range(problem.count[0]):
-        problem.past.feature[c], problem.past.collider[c] = problem.feature[c], problem.body[c]
-        problem.past.pair_sum[c] = ti.Vector([0.0, 0.0], ti.f64)
-        problem.past.point[c] = problem.point[c]
-        problem.past.impulse[c] = to_world(problem, c, problem.r[c])
-    ti.loop_config(serialize=problem.serial)
-    for k in range(problem.past.n_slots):
-        problem.past.slot[k] = problem.past.pair_slot[k] = -1
-    ti.loop_config(serialize=True)
-    for _ in range(1):
-        for c in range(problem.count[0]):
-            k = _slot(problem, problem.past.feature[c])
-            while problem.past.slot[k] >= 0:
-                k = (k + 1) & (problem.past.n_slots - 1)
-            problem.past.slot[k] = c
-
-
-@kernel
-def keep_impulses(p: ti.template(), common_offset: ti.f64):
-    """Store the present contacts as those of the previous step. common_offset: contact offset between different bodies [m]."""
-    enter_past(p)
-    ti.loop_config(serialize=True)
-    for _ in range(1):
-        for c in range(p.count[0]):
-            _count_load(p, c, common_offset)
-
-
-@ti.func
-def past_of(p: ti.template(), feature, point):
-    """The past contact with the same feature that is nearest to a point (3,), -1 if there is none."""
-    best, smallest = -1, ti.cast(ti.math.inf, ti.f64)
-    k = _slot(p, feature)
-    while p.past.slot[k] >= 0:
-        j = p.past.slot[k]
-        if (p.past.feature[j] == feature).all():
-            d = (p.past.point[j] - point).norm()
-            if d < smallest:
-                best, smallest = j, d
-        k = (k + 1) & (p.past.n_slots - 1)
-    return best
-
-
-@ti.func
-def _warm_impulse(p: ti.template(), c):
-    """World impulse of the nearest contact with the same feature in the previous step; 0 if there is none."""
-    j, impulse = past_of(p, p.feature[c], p.point[c]), dvec(0.0)
-    if j >= 0:
-        impulse = p.past.impulse[j]
-    return impulse
-
-
-@ti.func
 def relative_velocity(p: ti.template(), m: ti.template(), c, dt):
     """Velocity of side a relative to side b at contact c, at the present v [m/s]."""
     v = -p.obstacle_displacement[c] / dt
@@ -341,89 +234,42 @@ def fill(
     o: ti.template(),
     q: ti.template(),
     found: ti.template(),
-    kept: ti.template(),
-    n: ti.i32,
+    reduction: ti.template(),
+    n_kept: ti.i32,
     dt: ti.f64,
     warm: ti.f64,
+    common_offset: ti.f64,
+    indexes: ti.i32,
 ):
-    """Fill the problem's contacts from rows kept[:n] of the detector's buffer `found`. b and the r-factors are not set.
+    """Fill the problem's contacts from rows of the detector's buffer `found`, after its present ones have become those of the
+    past, and list the entries of each node. b and the r-factors are not set. Nothing is done in a batch that has ended.
 
-    s: Surface; o: AnalyticObstacles; q: PairNumbers. warm: factor of the previous step's impulses.
+    s: Surface; o: AnalyticObstacles; q: PairNumbers. n_kept: number of the reduction's rows to take, -1 for all. warm: factor of
+    the previous step's impulses; common_offset: contact offset between different bodies [m]; indexes: 0 if there are no entries,
+    nor were any before.
     """
-    clear_counts(p.room, n)
+    keep_impulses(p, common_offset, s.run[GO])
+    ti.loop_config(serialize=True)
+    for _ in range(1):
+        if s.run[GO] == 1:
+            p.count[0] = ti.select(n_kept < 0, reduction.count[LEFT], n_kept)
+    clear_counts(p.room, keys_if(s.run[GO], p.count[0]))
     ti.loop_config(serialize=p.serial)
-    for c in range(n):
-        count_entries(p.room, c, _room(m, found, kept[c]))
-    add_up_counts(p.room, n)
-    p.count[0], p.count[2] = n, p.room.start[n + 1]
+    for c in range(s.run[GO] * p.count[0]):
+        count_entries(p.room, c, _room(m, found, reduction.kept[c]))
+    add_up_counts(p.room, keys_if(s.run[GO], p.count[0]))
     ti.loop_config(serialize=p.serial)
-    for c in range(n):
-        fill_row(p, m, s, q, c, p.room.start[c + 1], found, kept[c])
+    for c in range(s.run[GO] * p.count[0]):
+        row = reduction.kept[c]
+        fill_row(p, m, s, q, c, p.room.start[c + 1], found, row)
         normal = p.normal[c]
         if ti.static(o.any):
-            if found.nodes_b[kept[c]][0] < 0:
+            if found.nodes_b[row][0] < 0:
                 p.obstacle_displacement[c] = obstacle_displacement_at(o, p.body[c][1], p.point[c] - 0.5 * p.gap[c] * normal)
-        p.approach[c], p.load[c] = normal.dot(relative_velocity(p, m, c, dt)), warm * _load(p, c)
-        p.r[c] = prox(to_frame(p, c, warm * _warm_impulse(p, c)), p.friction[c])
-
-
-@ti.func
-def _self_contact_factor(body):
-    """SELF_CONTACT if a pair of colliders is one body, else 1."""
-    return ti.select(body[0] == body[1], ti.cast(SELF_CONTACT, ti.f64), ti.cast(1.0, ti.f64))
-
-
-@ti.func
-def offset_between(body, is_guard, common):
-    """Contact offset [m] of a contact between a pair of colliders; common: that between different bodies."""
-    return _self_contact_factor(body) * ti.select(is_guard == 1, GUARD * common, common)
-
-
-@ti.func
-def contact_offset_of(p: ti.template(), c, common):
-    """Contact offset of contact c [m]; common: that between different bodies."""
-    return offset_between(p.body[c], p.guard[c], common)
-
-
-@ti.func
-def gap_minus_target(
-    p: ti.template(), c, dt, common_offset, penetration_fraction, offset_fraction, max_speed, min_opening, least_gap
-):
-    """gap - target of contact c [m].
-
-    common_offset: contact offset between different bodies [m]. penetration_fraction, offset_fraction: fractions of a penetration
-    and of a missing contact offset that the step corrects, at most at max_speed [m/s]. min_opening: for restitution, or 0 [m].
-    least_gap: part of the contact offset to which a smaller gap opens at once.
-    Where offset_fraction is 1, every gap opens to the contact offset at once.
-    """
-    gap, own, contact_offset = p.gap[c], _self_contact_factor(p.body[c]), contact_offset_of(p, c, common_offset)
-    whole = own * common_offset  # of a guard, too, where it says what rests
-    target = contact_offset
-    if gap < contact_offset and offset_fraction < 1.0:
-        above = ti.max(gap, 0.0)
-        opening = own * (offset_fraction * (contact_offset - above) + penetration_fraction * (above - gap))
-        if gap >= 0.0:
-            opening = ti.max(opening, least_gap * contact_offset - gap)
-        pressed = dt * (p.load[c] + ti.max(-p.approach[c], 0.0))
-        if gap > -whole and pressed < STILL * whole:
-            opening = ti.min(opening, PRESSED * pressed)
-        target = gap + ti.min(opening, max_speed * dt)
-    if min_opening > 0.0:
-        target = ti.max(target, gap + min_opening)
-    return gap - target
-
-
-@kernel
-def set_targets(
-    p: ti.template(), dt: ti.f64, common_offset: ti.f64, penetration_fraction: ti.f64, offset_fraction: ti.f64, max_speed: ti.f64
-):
-    """Set the targets of all contacts in an implicit step of dt [s], without restitution; the others as of `gap_minus_target`."""
-    none, least = ti.cast(0.0, ti.f64), ti.cast(LEAST_GAP, ti.f64)
-    ti.loop_config(serialize=p.serial)
-    for c in range(p.count[0]):
-        p.target[c] = p.gap[c] - gap_minus_target(
-            p, c, dt, common_offset, penetration_fraction, offset_fraction, max_speed, none, least
-        )
+        p.approach[c], p.load[c] = normal.dot(relative_velocity(p, m, c, dt)), warm * load_of(p, c)
+        p.r[c] = prox(to_frame(p, c, warm * warm_impulse(p, c)), p.friction[c])
+    p.count[2] = p.room.start[p.count[0] + 1]
+    list_entries(p, s.run[GO] * indexes)
 
 
 @kernel

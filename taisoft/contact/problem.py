@@ -18,7 +18,7 @@ import scipy.sparse as sp
 import taichi as ti
 
 from taisoft.backend.arrays import Count, FieldArena, download, upload
-from taisoft.backend.lists import Lists, add_up_counts, clear_counts, count_entry, make_lists, place_of_entry, sort_lists
+from taisoft.backend.lists import Lists, add_up_counts, clear_counts, count_entry, keys_if, make_lists, place_of_entry, sort_lists
 from taisoft.backend.paths import on_gpu_path
 from taisoft.backend.runtime import kernel
 from taisoft.backend.team import Team, make_team
@@ -57,10 +57,14 @@ class PastContacts:
     point: Any  # 3-vectors [m]
     impulse: Any  # 3-vectors, world frame [N s]
     collider: Any  # 2-vectors i32
-    n_slots: Count  # size of the hash table, a power of two
-    slot: Any  # (n_slots) i32: hash table of the contacts, -1 if empty
-    pair_slot: Any  # (n_slots) i32: of their pairs of colliders, each by one of its contacts, -1 if empty
-    pair_sum: Any  # 2-vectors: sums of normal impulses [N s] and of r-factors [kg] over a pair's contacts
+    mask: Any  # (1) i32: number of buckets and of slots in use, a power of two, minus one
+    by_feature: Lists  # of the contacts in each bucket, in `member`
+    member: Any  # i32
+    bucket: Any  # i32: of each contact; then the slot of its pair
+    pair: Any  # i32: first contact of each one's pair of colliders
+    pair_slot: Any  # i32: hash table of the pairs, by their first contacts, -1 if free
+    claim: Any  # i32: lowest of the contacts that have come to a free slot
+    pair_sum: Any  # 2-vectors: sums of normal impulses [N s] and of r-factors [kg] over a pair's contacts, at the first
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,14 +136,16 @@ class ContactProblem:
 
 def build_node_problem(arena: FieldArena, capacity: int, n_nodes: int, serial: bool, entries: int) -> ContactProblem:
     """Allocate a problem for contacts between the nodes of a model, whose rows have up to `entries` entries in all."""
-    n, n_slots = capacity, 1 << (2 * capacity - 1).bit_length()
+    n, n_slots = capacity, max(64, 1 << (2 * capacity - 1).bit_length())
     past = PastContacts(
-        n_slots=n_slots,
         **_fields(arena, "feature", ti.i32, n, 3, "past_contact"),
         **_fields(arena, "collider", ti.i32, n, 2, "past_contact"),
         **_fields(arena, "point impulse", ti.f64, n, 3, "past_contact"),
         **_fields(arena, "pair_sum", ti.f64, n, 2, "past_contact"),
-        **_fields(arena, "slot pair_slot", ti.i32, n_slots, 0, "past_contact"),
+        **_fields(arena, "member bucket pair", ti.i32, n, 0, "past_contact"),
+        **_fields(arena, "pair_slot claim", ti.i32, n_slots, 0, "past_contact"),
+        **_fields(arena, "mask", ti.i32, 1, 0, "past_contact"),
+        by_feature=make_lists(arena, "past_contact", n_slots, serial),
     )
     renewal = RenewalWork(
         **_fields(arena, "fate match is_kept", ti.i32, n, 0, "renewal"),
@@ -396,17 +402,23 @@ def find_factors(problem: ti.template()):
             problem.r[c] = dvec(0.0)
 
 
-@kernel
-def index_nodes(problem: ti.template()):
-    """List the entries of each node, in ascending order."""
-    clear_counts(problem.by_node, problem.n_nodes)
+@ti.func
+def list_entries(problem: ti.template(), go):
+    """List the entries of each node, in ascending order, if go is 1; if it is 0, do nothing. Top-level loops of a kernel."""
+    clear_counts(problem.by_node, keys_if(go, problem.n_nodes))
     ti.loop_config(serialize=problem.by_node.serial)
-    for c in range(problem.count[0]):
+    for c in range(go * problem.count[0]):
         for e in range(problem.first[c], problem.first[c] + problem.arity[c]):
             count_entry(problem.by_node, problem.node[e])
-    add_up_counts(problem.by_node, problem.n_nodes)
+    add_up_counts(problem.by_node, keys_if(go, problem.n_nodes))
     ti.loop_config(serialize=problem.by_node.serial)
-    for c in range(problem.count[0]):
+    for c in range(go * problem.count[0]):
         for e in range(problem.first[c], problem.first[c] + problem.arity[c]):
             problem.entry[place_of_entry(problem.by_node, problem.node[e])] = e
-    sort_lists(problem.by_node, problem.n_nodes, problem.entry)
+    sort_lists(problem.by_node, keys_if(go, problem.n_nodes), problem.entry)
+
+
+@kernel
+def index_nodes(problem: ti.template()):
+    """See `list_entries`."""
+    list_entries(problem, 1)

@@ -22,7 +22,7 @@ nothing and has no fixed nodes; for others no loss is assumed. The loss of the f
 import taichi as ti
 
 from taisoft.backend.runtime import kernel
-from taisoft.contact.build import contact_offset_of
+from taisoft.contact.targets import contact_offset_of
 
 NEGLIGIBLE_OPENING = 0.01  # of the contact offset: a rebound that opens the gap less in a step is ignored
 

@@ -15,19 +15,17 @@ from taisoft.collision.detector import Detection
 from taisoft.collision.intersections import CROSSED
 from taisoft.collision.path_check import NO_PASSAGES
 from taisoft.contact.build import (
-    SELF_CONTACT,
     build_pair_numbers,
     drop_vanishing,
     end_contacts,
     fill,
     has_impact,
-    keep_impulses,
     most_entries,
     scale_impulses,
-    set_targets,
     upload_pair_numbers,
 )
 from taisoft.contact.problem import build_node_problem, index_nodes
+from taisoft.contact.targets import SELF_CONTACT, set_targets
 from taisoft.dynamics.asleep import AsleepContacts, Rows, Sides, join, select
 from taisoft.dynamics.contact_measures import DEEP_PENETRATION, DEPTH, RELATIVE_PENETRATION, ContactMeasures, Crossing
 from taisoft.dynamics.contact_paths import ContactPaths
@@ -299,15 +297,14 @@ class ContactStep:
         problem = self.problem
         if model.has_dependents and n:
             n = drop_vanishing(problem, model, surface, found, kept, n, 0)  # the past's entries are needed no more
-        keep_impulses(problem, self.contact_offset)
         warm = dt / self._last_time if self._last_time > 0.0 else 0.0
-        fill(problem, model, surface, shapes, self.numbers, found, kept, n, dt, warm)
+        indexes = int(n > 0 or self._indexed)  # an empty index needs no update
+        what = model, surface, shapes, self.numbers, found, self.detection.reduction
+        fill(problem, *what, n, dt, warm, self.contact_offset, indexes)
+        self._indexed = n > 0
         if not self._explicit:
             set_targets(problem, dt, *self.gap_targets)
         self._renewal.sides, self._renewal.n_looks = self.detection.sides(kept.to_numpy(n)) if model.has_dependents else None, 0
-        if n or self._indexed:  # an empty index needs no update
-            index_nodes(problem)
-            self._indexed = n > 0
         self._last_time, self._impulse_fraction, self.had_impact = dt, 1.0, False
         return n
 

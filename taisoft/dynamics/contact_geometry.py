@@ -30,9 +30,11 @@ from taisoft.collision.contacts import EDGE_EDGE, FACE_FACE, FACE_FIELD, MORTAR,
 from taisoft.collision.features import closest_lines
 from taisoft.collision.overlay import BEHIND
 from taisoft.collision.surface import dvec
-from taisoft.contact.build import contact_offset_of, enter_past, fill_row, offset_between, pair_slot, past_of
+from taisoft.contact.build import fill_row
+from taisoft.contact.past import enter_past, pair_slot, past_of
 from taisoft.contact.problem import to_frame
 from taisoft.contact.prox import prox, tangent
+from taisoft.contact.targets import contact_offset_of, offset_between
 
 TURNED, MISSED = 1e-3, 0.02  # [rad]; of the contact offset: smaller changes of a contact do not count
 SHIFTED = 0.05  # of the finer side's edge: a smaller slip does not change where a contact acts on another body
@@ -174,14 +176,11 @@ def _keep_untrusted(
 ):
     """Mark the pairs whose contacts stay as they are."""
     for c in range(p.count[0]):
-        slot = pair_slot(p, p.body[c])
-        if p.past.pair_slot[slot] < 0:
-            p.past.pair_slot[slot] = c
         p.renewal.is_kept[c] = 0
         if p.body[c][0] != p.body[c][1]:  # all contacts of a body with itself are one pair
             closing = -ti.min(p.normal[c].dot(_motion(p, c, displacement)), dt * p.approach[c])
             if closing > ti.cast(TRUSTED_CLOSING, ti.f64) * _finer_edge(s, p.body[c]):
-                p.renewal.is_kept[p.past.pair_slot[slot]] = 1
+                p.renewal.is_kept[p.past.pair[c]] = 1
     for b in range(n):
         if found.gap[kept[b]] < -ti.cast(TRUSTED_DEPTH, ti.f64) * margin:
             first = p.past.pair_slot[pair_slot(p, found.body[kept[b]])]
@@ -195,7 +194,7 @@ def _judge_present(
 ):
     """Set the fate of present contact c, as far as that does not depend on those found. Return 1 if its geometry changes."""
     fate, changed, kind = OPEN, 0, p.feature[c][0]
-    if kind == FACE_FACE or p.renewal.is_kept[p.past.pair_slot[pair_slot(p, p.body[c])]] == 1:
+    if kind == FACE_FACE or p.renewal.is_kept[p.past.pair[c]] == 1:
         fate = KEPT
     elif kind == FACE_FIELD:
         fate = KEPT
@@ -293,7 +292,7 @@ def judge(
     s, end: surfaces at the step's start and at its end; o: analytic obstacles; x_start, displacement: (n_nodes) 3-vectors [m];
     found, kept: buffer and the n rows in it; common_offset, margin, floor [m].
     """
-    enter_past(p)
+    enter_past(p, 1)
     changed = 0
     ti.loop_config(serialize=True)
     for _ in range(1):

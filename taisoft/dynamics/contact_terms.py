@@ -14,9 +14,9 @@ import taichi as ti
 
 from taisoft.backend.arrays import FieldArena
 from taisoft.backend.runtime import kernel
-from taisoft.contact.build import contact_offset_of
 from taisoft.contact.problem import RESIDUAL, ContactProblem, residual_of
 from taisoft.contact.prox import OPEN, dvec, into_disk, prox, scaled, state_of
+from taisoft.contact.targets import contact_offset_of
 from taisoft.fem.model import Model
 from taisoft.linear.block_csr import BLOCK
 from taisoft.linear.coupling import NO_COUPLING, Coupling, build_coupling

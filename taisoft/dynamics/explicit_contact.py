@@ -7,10 +7,11 @@ velocity, which moves the nodes. M is lumped, so M^-1 is diagonal (report, secti
 import taichi as ti
 
 from taisoft.backend.runtime import kernel
-from taisoft.contact.build import gap_minus_target, relative_velocity
+from taisoft.contact.build import relative_velocity
 from taisoft.contact.problem import impulse_on, to_frame
 from taisoft.contact.prox import dvec
 from taisoft.contact.restitution import explicit_opening
+from taisoft.contact.targets import gap_minus_target
 from taisoft.dynamics.explicit import (
     compute_reactions,
     euler_velocity,

@@ -9,8 +9,8 @@ import numpy as np
 
 from taisoft.backend.arrays import download
 from taisoft.collision.contacts import Contacts, in_columns, named_contacts
-from taisoft.contact.build import GUARD, SELF_CONTACT
 from taisoft.contact.problem import ContactProblem, fill_rows, read_entries
+from taisoft.contact.targets import GUARD, SELF_CONTACT
 from taisoft.scene.scene import Scene
 
 Pairs = tuple[np.ndarray, np.ndarray]  # colliders (k,2), the lower index first, and their sums (k,13), see `sum_pairs`

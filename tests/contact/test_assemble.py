@@ -14,7 +14,7 @@ import taichi as ti
 import taisoft as ts
 from taisoft.backend.arrays import FieldArena
 from taisoft.backend.runtime import kernel
-from taisoft.contact.build import gap_minus_target
+from taisoft.contact.targets import gap_minus_target
 from taisoft.contact.problem import build_node_problem, fill_field, read_entries
 from taisoft.contact.restitution import explicit_opening, find_rebounds
 from tests.collision.rotations import rotation
