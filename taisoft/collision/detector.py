@@ -176,7 +176,7 @@ class Detection:
         Raise SimulationError if positions are not finite, or if a buffer would outgrow its limit.
         """
         if self.only_shapes and not len(held.pairs):
-            motion = self._motion(time, dt, prescribed, path)
+            motion = self.motion(time, dt, prescribed, path)
             fill(lambda: self.search_shapes(motion, none_cross), self.buffer)
             self._refuse_nonfinite()
             self._reduction.read()
@@ -199,13 +199,13 @@ class Detection:
         return not self.has_pairs and self.shapes.any
 
     def search_shapes(self, motion: tuple, none_cross: bool, room: int = 0, event: int = 0) -> None:
-        """Launch `search_shapes`, in scenes with `only_shapes`. motion: of `_motion`; room, event: as there."""
+        """Launch `search_shapes`, in scenes with `only_shapes`. motion: of `motion`; room, event: as there."""
         reduction = self._reduction
         x, *others = motion
         search = self.margin, self.buffer.parts, reduction.prepare(), *reduction.scales, self._lowest_gap(none_cross)
         search_shapes(self.surface, self.shapes, x, *others, self.reach, *search, room, event)
 
-    def _motion(self, time: float, dt: float, prescribed=None, path=None, x=None) -> tuple:
+    def motion(self, time: float, dt: float, prescribed=None, path=None, x=None) -> tuple:
         """Place the obstacles; return what else moves the surface, see `update_surface`: x, v, whether vertices are prescribed,
         these, and dt. x: the nodes' positions if not the present ones."""
         m = self.model
@@ -221,8 +221,8 @@ class Detection:
         return m.state.x if x is None else x, v, has_prescribed, moves, span
 
     def _move(self, time: float, dt: float, prescribed=None, path=None, x=None) -> None:
-        """Update positions and displacements of the surface, and the boxes; the arguments are those of `_motion`."""
-        update_surface(self.surface, *self._motion(time, dt, prescribed, path, x), self.reach, self.has_pairs)
+        """Update positions and displacements of the surface, and the boxes; the arguments are those of `motion`."""
+        update_surface(self.surface, *self.motion(time, dt, prescribed, path, x), self.reach, self.has_pairs)
         self._refuse_nonfinite()
 
     def _refuse_nonfinite(self) -> None:
@@ -284,6 +284,10 @@ class Detection:
             find_analytic(s, shapes, self.margin, out, append)
             append = 1
         return append
+
+    def adopt(self, found: int, kept: int) -> None:
+        """Take over the numbers of contacts of a search that was not read, in a scene with `only_shapes`."""
+        self._reduction.n_found, self._reduction.n_kept = self.counts.found, self.counts.contacts = found, kept
 
     def _count(self) -> None:
         """Update the counts."""

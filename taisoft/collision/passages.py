@@ -21,12 +21,12 @@ from taisoft.backend.arrays import FieldArena
 from taisoft.backend.lists import part_first
 from taisoft.backend.runtime import kernel
 from taisoft.collision.analytic import CAPSULE, HALF_SPACE, SPHERE, rotation_rows
-from taisoft.collision.candidates import sum_parts
+from taisoft.collision.candidates import TOTAL, sum_parts
 from taisoft.collision.contacts import FACE_FACE, write_contact
 from taisoft.collision.features import unit
 from taisoft.collision.near_list import OUTDATED, STILL, UNCOVERED, clear_ends, hint_of, list_unseparated, prepare_paths
 from taisoft.collision.separation import at_weights, free_until, nearest_of, separating_plane, unit_row
-from taisoft.collision.surface import dvec, ivec
+from taisoft.collision.surface import EVENT, GO, dvec, ivec
 
 # kinds of passages, by two ids: two triangles; a row of `adjacent`; a triangle and a sphere or capsule; a vertex and a half-space
 NEAR, ADJACENT, ROUND, FLAT = range(4)
@@ -253,12 +253,14 @@ def check_paths(
     limit: ti.f64,
     listed_limit: ti.f64,
     floor: ti.f64,
+    event: ti.i32,
 ):
     """Find the passages on the paths to the positions x (n_nodes) [m] (TO_STATE), on the searched ones (SEARCHED), on those given
     (GIVEN), or where surfaces are already, half-spaces left out (STILL).
 
     near: listed pairs. begin, end: parts of the step between which obstacles move. limit, listed_limit [m]: see `prepare_paths`;
-    beyond them, nothing is checked. floor [m]: to be kept.
+    beyond them, nothing is checked. floor [m]: to be kept. event: number of the event that ends a batch if paths are not known to
+    be free; 0 outside of batches.
     """
     span = ti.Vector([begin, end], ti.f64)
     prepare_paths(s, x, g, mode, limit, listed_limit, floor)
@@ -278,6 +280,10 @@ def check_paths(
     if ti.static(g.has_pairs):
         clear_ends(s, g)
     sum_parts(out)
+    ti.loop_config(serialize=True)
+    for _ in range(1):
+        if event != 0 and s.run[GO] == 1 and g.left[UNCOVERED] + g.left[OUTDATED] + out.count[TOTAL] > 0:
+            s.run[GO], s.run[EVENT] = 0, event
 
 
 @kernel(cse=False)

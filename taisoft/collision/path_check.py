@@ -12,7 +12,7 @@ from taisoft.collision.bent_path import TRIALS, find_inwards, set_leg
 from taisoft.collision.bvh import Trees
 from taisoft.collision.candidates import TOTAL, Buffer, Pairs, fill, list_pairs, pair_entries
 from taisoft.collision.colliders import Topology
-from taisoft.collision.near_list import GIVEN, HINTS, OUTDATED, SEARCHED, STILL, UNCOVERED, PathFields
+from taisoft.collision.near_list import GIVEN, HINTS, OUTDATED, SEARCHED, STILL, TO_STATE, UNCOVERED, PathFields
 from taisoft.collision.passages import ADJACENT, FLAT, N_KINDS, NEAR, ROUND, check_paths, passage_fields
 from taisoft.collision.surface import Surface, integers
 from taisoft.ranges import expand
@@ -215,7 +215,7 @@ class PathCheck:
                 is_new = True
             limit, listed_limit = self.limit if covers else np.inf, np.inf if is_new or not covers else self._listed_limit(broad)
             lists = self.near.parts, self.passages.parts
-            check_paths(s, x, self.shapes, self.fields, *lists, mode, begin, end, limit, listed_limit, self.floor)
+            check_paths(s, x, self.shapes, self.fields, *lists, mode, begin, end, limit, listed_limit, self.floor, 0)
             if self.fields.left[UNCOVERED]:
                 return None
             if self.fields.left[OUTDATED]:
@@ -225,6 +225,11 @@ class PathCheck:
             elif not self.passages.grow_if_full():
                 break
         return self._read()
+
+    def check_in_batch(self, x, event: int) -> None:
+        """Check the paths to positions x [m] in a scene without pairs of triangles. event: see `check_paths`."""
+        lists, limits = (self.near.parts, self.passages.parts), (np.inf, np.inf, self.floor)
+        check_paths(self.surface, x, self.shapes, self.fields, *lists, TO_STATE, 0.0, 1.0, *limits, event)
 
     def _read(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the passages found."""

@@ -296,13 +296,20 @@ def has_impact(p: ti.template(), rigid: ti.template(), dt: ti.f64, contact_offse
 
 @kernel
 def end_contacts(p: ti.template(), m: ti.template(), x_start: ti.template(), accumulated: ti.template(), explicit_dt: ti.f64):
+    """See `finish_contacts`."""
+    finish_contacts(p, m, x_start, accumulated, explicit_dt, 1)
+
+
+@ti.func
+def finish_contacts(p: ti.template(), m: ti.template(), x_start: ti.template(), accumulated: ti.template(), explicit_dt, go):
     """Set gaps to those at the present positions, after a step from the positions x_start (n_nodes) [m], and the slips since.
 
     Add to `accumulated` (n_nodes) f64 [m] the length of each node's mean slip, weighted by normal impulses, in which what sticks
     counts 0. explicit_dt: dt of an explicit step [s], whose states are set; 0 for an implicit one, which has set them.
+    go: 0 to do nothing. Top-level loops of a kernel.
     """
     ti.loop_config(serialize=p.serial)
-    for c in range(p.count[0]):
+    for c in range(go * p.count[0]):
         motion = -p.obstacle_displacement[c]
         for e in range(p.first[c], p.first[c] + p.arity[c]):
             i = p.node[e]
@@ -314,7 +321,7 @@ def end_contacts(p: ti.template(), m: ti.template(), x_start: ti.template(), acc
             step = scaled(p.factor[c], to_frame(p, c, p.slip[c] / explicit_dt))
             p.status[c] = state_of(p.r[c] - step, p.friction[c] * p.r[c][0])
     ti.loop_config(serialize=m.serial)
-    for i in range(m.n_nodes):
+    for i in range(go * m.n_nodes):
         slip, load = dvec(0.0), ti.cast(0.0, ti.f64)
         for at in range(p.by_node.start[i], p.by_node.start[i + 1]):
             c = p.contact[p.entry[at]]

@@ -394,12 +394,18 @@ def find_factors(problem: ti.template()):
     """Set the r-factors from the diagonal of W."""
     ti.loop_config(serialize=problem.serial)
     for c in range(problem.count[0]):
-        B = own_block(problem, c)
-        across = ti.max(B[1, 1], B[2, 2])
-        problem.factor[c][0] = ti.select(B[0, 0] > 0.0, 1.0 / B[0, 0], 0.0)
-        problem.factor[c][1] = ti.select(across > 0.0, 1.0 / across, 0.0)
-        if B[0, 0] <= 0.0:  # immovable
-            problem.r[c] = dvec(0.0)
+        set_factors(problem, c)
+
+
+@ti.func
+def set_factors(problem: ti.template(), c):
+    """Set the r-factors of contact c."""
+    B = own_block(problem, c)
+    across = ti.max(B[1, 1], B[2, 2])
+    problem.factor[c][0] = ti.select(B[0, 0] > 0.0, 1.0 / B[0, 0], 0.0)
+    problem.factor[c][1] = ti.select(across > 0.0, 1.0 / across, 0.0)
+    if B[0, 0] <= 0.0:  # immovable
+        problem.r[c] = dvec(0.0)
 
 
 @ti.func

@@ -22,6 +22,7 @@ Sources: Nesterov 1983; O'Donoghue and Candes 2015 for the restart.
 
 from dataclasses import dataclass, field
 
+import numpy as np
 import taichi as ti
 
 from taisoft.backend.runtime import kernel
@@ -77,36 +78,44 @@ def solve(
     every: int = CHECK_EVERY,
     history: bool = False,
     momentum: bool = True,
+    is_begun: bool = False,
 ) -> SolveResult:
     """Solve the problem, starting from its impulses and replacing them by the best ones found.
 
     method: one of SOLVERS; coloured_gauss_seidel requires grouped contacts, see `colouring`. tolerance: bound on the residual.
     max_iterations: sweeps. every: sweeps between residual checks. history: whether to return the residual of each check.
-    momentum: False for the plain method.
+    momentum: False for the plain method. is_begun: whether `sweeps_of_team` has taken some of the sweeps.
     """
     n_contacts = int(problem.count[0])
-    team, is_parallel = _team_of(problem, method, n_contacts)
-    batch = max(1, min(HISTORY - 1, LAUNCH_VISITS // max(1, n_contacts) // every)) * every
-    remaining, first, residuals = max_iterations, 1, []
-    while True:
-        n = min(batch, remaining)
+    team, is_parallel = team_of(problem, method, n_contacts)
+    batch, residuals, state, first = sweeps_per_launch(n_contacts, every), [], problem.sweep.state.to_numpy(), int(not is_begun)
+    taken = 0 if first else int(state[SWEEPS])
+    while first or (taken < max_iterations and not state[RESIDUAL] <= tolerance):
+        n = min(batch, max_iterations - taken)
         if is_parallel:
             _run_parallel(problem, method, first, n, every, tolerance, int(momentum))
         else:
             _run(problem, team, method, first, n, every, tolerance, int(momentum))
-        remaining, first = remaining - n, 0
-        state = problem.sweep.state.to_numpy()
+        state, taken, first = problem.sweep.state.to_numpy(), taken + n, 0
         if history:
             residuals += problem.sweep.history.to_numpy(int(state[CHECKS])).tolist()
-        if remaining == 0 or state[RESIDUAL] <= tolerance:
-            break
     if not state[RESIDUAL] <= state[BEST]:
         _restore_best(problem, team)
         state[RESIDUAL] = state[BEST]
-    return SolveResult(int(state[SWEEPS]), float(state[RESIDUAL]), bool(state[RESIDUAL] <= tolerance), residuals)
+    return result_of(state, tolerance, residuals)
 
 
-def _team_of(problem: ContactProblem, method: str, n_contacts: int) -> tuple[Team, bool]:
+def result_of(state: np.ndarray, tolerance: float, residuals: list[float] | None = None) -> SolveResult:
+    """The result of a solve from the state of its sweeps."""
+    return SolveResult(int(state[SWEEPS]), float(state[RESIDUAL]), bool(state[RESIDUAL] <= tolerance), residuals or [])
+
+
+def sweeps_per_launch(n_contacts: int, every: int = CHECK_EVERY) -> int:
+    """Most sweeps in a launch."""
+    return max(1, min(HISTORY - 1, LAUNCH_VISITS // max(1, n_contacts) // every)) * every
+
+
+def team_of(problem: ContactProblem, method: str, n_contacts: int) -> tuple[Team, bool]:
     """Return the team for a problem of so many contacts, and whether all threads share its loops instead."""
     if problem.serial or method == "gauss_seidel":  # which has no parallel form
         return ALONE, False

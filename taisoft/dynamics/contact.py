@@ -138,7 +138,7 @@ class ContactStep:
         return max(capacity, 2 * n), max(most, 2 * entries)
 
     @property
-    def _has_paths(self) -> bool:
+    def has_paths(self) -> bool:
         """Whether motion is prescribed: the user may change it between two steps, and a path may end with the last one."""
         simulation = self.simulation
         return simulation.dirichlet.n_prescribed > 0 or not all(o.rests(simulation.time) for o in simulation.scene.obstacles)
@@ -269,9 +269,9 @@ class ContactStep:
         """Return whether nothing can touch in an explicit step of dt from a time, see `far_apart`: it needs no search."""
         now, counts, far = self.simulation.now, self.detection.counts, self.far
         if not far.covers(time + dt):
-            if not self._explicit or self.n_contacts or counts.active or counts.found or not now.none_cross or self._has_paths:
+            if not self._explicit or self.n_contacts or counts.active or counts.found or not now.none_cross or self.has_paths:
                 return False
-            if not far.is_due():
+            if not far.is_due() or (self.detection.only_shapes and not self.simulation.model.on_cpu):  # batches take them
                 return False
             self._searched = None
             far.search(time, dt)
@@ -297,16 +297,37 @@ class ContactStep:
         problem = self.problem
         if model.has_dependents and n:
             n = drop_vanishing(problem, model, surface, found, kept, n, 0)  # the past's entries are needed no more
-        warm = dt / self._last_time if self._last_time > 0.0 else 0.0
         indexes = int(n > 0 or self._indexed)  # an empty index needs no update
         what = model, surface, shapes, self.numbers, found, self.detection.reduction
-        fill(problem, *what, n, dt, warm, self.contact_offset, indexes)
+        fill(problem, *what, n, dt, self.warm_factor(dt), self.contact_offset, indexes)
         self._indexed = n > 0
         if not self._explicit:
             set_targets(problem, dt, *self.gap_targets)
         self._renewal.sides, self._renewal.n_looks = self.detection.sides(kept.to_numpy(n)) if model.has_dependents else None, 0
         self._last_time, self._impulse_fraction, self.had_impact = dt, 1.0, False
         return n
+
+    def warm_factor(self, dt: float) -> float:
+        """Return the factor of the last substep's impulses from which one of dt [s] starts."""
+        return dt / self._last_time if self._last_time > 0.0 else 0.0
+
+    def begin_batch(self) -> None:
+        """Prepare for sub-steps that the host does not follow, after a search."""
+        self.gap_targets = self._gap_targets()
+
+    def end_batch(self, time: float, dt: float, found_before: int, found: int, kept: int, is_whole: bool) -> None:
+        """Take over after sub-steps of dt [s] that the host has not followed; time: after those that were accepted.
+
+        found_before, found, kept: contacts of the search before the last one, and of the last one. is_whole: whether the next
+        sub-step has not begun.
+        """
+        self.detection.adopt(found, kept)
+        self.measures.begin(dt)
+        self._searched, self._measured_end = (time, dt), None
+        self._search_counts = (found_before if is_whole else found, 0)
+        self._last_time, self._impulse_fraction, self.had_impact, self._indexed = dt, 1.0, False, True
+        self._renewal.sides, self._renewal.n_looks = None, 0
+        self.measure_crossings()
 
     def renew(self, x_start: Any, displacement: Any) -> bool:
         """Take the contacts' geometry at displacements from x_start, (n_nodes) 3-vectors f64 [m] each; return whether it changed.
@@ -554,7 +575,7 @@ class ContactStep:
         try:
             self.search(time, dt)
         except SimulationError:
-            if not self._has_paths:
+            if not self.has_paths:
                 raise
             self._find(time, 0.0)  # a path ends here; the next step reports it
         closing = self.measures.closing
@@ -562,7 +583,7 @@ class ContactStep:
         if not self._explicit:
             crossing = self.measure_crossings()
             depth, self.relative_penetration = max(depth, crossing[0]), max(self.relative_penetration, crossing[1])
-        if self._has_paths:
+        if self.has_paths:
             self._searched = None
         self._depth, self._measured_end = depth, (time, dt)
         return depth

@@ -126,7 +126,9 @@ def prescribe(m: ti.template(), s: ti.template(), row, dt):
 
 @ti.func
 def prescribe_velocities(m: ti.template(), s: ti.template(), row, dt):
-    """Set the velocity of the prescribed nodes to their displacement over dt."""
+    """Set the velocity of the prescribed nodes to their displacement over dt. A loop of its own: on the CPU on one thread, since
+    several would take longer to start."""
+    ti.loop_config(serialize=m.on_cpu)
     for k in range(s.n_prescribed):
         i = s.prescribed_nodes[k]
         for a in ti.static(range(3)):
@@ -136,7 +138,8 @@ def prescribe_velocities(m: ti.template(), s: ti.template(), row, dt):
 
 @ti.func
 def prescribe_positions(m: ti.template(), s: ti.template(), row):
-    """Move the prescribed nodes to their targets."""
+    """Move the prescribed nodes to their targets, in such a loop."""
+    ti.loop_config(serialize=m.on_cpu)
     for k in range(s.n_prescribed):
         i = s.prescribed_nodes[k]
         for a in ti.static(range(3)):
@@ -145,18 +148,9 @@ def prescribe_positions(m: ti.template(), s: ti.template(), row):
 
 
 @ti.func
-def prescribe_all(m: ti.template(), s: ti.template(), row, dt):
-    """`prescribe`, in loops: on the CPU on one thread, since several would take longer to start."""
-    if ti.static(m.on_cpu):
-        ti.loop_config(serialize=True)
-        for _ in range(1):
-            prescribe(m, s, row, dt)
-    else:
-        prescribe(m, s, row, dt)
-
-
-@ti.func
 def save_prescribed_positions(m: ti.template(), s: ti.template()):
+    """Save the positions of the prescribed nodes, in such a loop."""
+    ti.loop_config(serialize=m.on_cpu)
     for k in range(s.n_prescribed):
         s.before[k] = m.state.x[s.prescribed_nodes[k]]
 
@@ -173,9 +167,10 @@ def set_loads(m: ti.template(), s: ti.template(), row):
 
 
 @ti.func
-def compute_reactions(m: ti.template(), s: ti.template(), dt):
-    """Compute the constraint force on held nodes, m (v_new - v_old)/dt - f [N], v_old from `held_velocity`."""
-    for k in range(s.n_held):
+def compute_reactions(m: ti.template(), s: ti.template(), dt, n):
+    """Compute the constraint force on the first n held nodes, m (v_new - v_old)/dt - f [N], v_old from `held_velocity`."""
+    ti.loop_config(serialize=m.on_cpu)
+    for k in range(n):
         i = s.held[k]
         mass = m.mass[i]
         f, a = forces(m, i)
@@ -192,6 +187,7 @@ def compute_reactions(m: ti.template(), s: ti.template(), dt):
 @ti.func
 def save_held_velocities(m: ti.template(), s: ti.template(), n):
     """Save the velocities of the first n held nodes: of all before the last sub-step, whose reactions need them."""
+    ti.loop_config(serialize=m.on_cpu)
     for k in range(n):
         s.held_velocity[k] = m.state.v[s.held[k]]
 
@@ -216,7 +212,7 @@ def begin_substep(m: ti.template(), s: ti.template(), row, dt, saves, drifts):
             verlet_drift(m, s, i, dt, verlet_half(m, s, i, dt, verlet_decay(m, s, i, dt)))
         turn_all(m, s, dt)
         if ti.static(s.has_prescribed):
-            prescribe_all(m, s, row, dt)
+            prescribe(m, s, row, dt)
     if ti.static(s.has_varied_loads):
         ti.loop_config(serialize=True)
         for _ in range(1):
@@ -246,7 +242,7 @@ def end_substep(m: ti.template(), s: ti.template(), row, dt, drift):
     else:
         turn_all(m, s, dt)
     if ti.static(s.has_prescribed):
-        prescribe_all(m, s, row, dt)
+        prescribe(m, s, row, dt)
     place_all(m)
     ti.loop_config(serialize=True)
     for _ in range(1):
@@ -286,7 +282,7 @@ def advance_alone(m: ti.template(), s: ti.template(), n: ti.i32, dt: ti.f64, res
                 begin_substep(m, s, row, dt, int(row == n - 1), 1 - begun)
                 if ti.static(s.verlet):
                     viscosity.follow(m)
-            elasticity.sum_elements_with_damping(m)
+            elasticity.sum_elements_with_damping(m, 1)
             if starting:  # forces alone, in the loop of the sub-steps: another copy of them takes long to compile
                 if ti.static(s.verlet):
                     for i in range(m.n_nodes):
@@ -301,7 +297,7 @@ def advance_alone(m: ti.template(), s: ti.template(), n: ti.i32, dt: ti.f64, res
                     viscosity.follow(m)
                 row += 1
         if ti.static(s.has_held):
-            compute_reactions(m, s, dt)
+            compute_reactions(m, s, dt, s.n_held)
 
 
 @kernel
@@ -315,7 +311,7 @@ def begin_batch(m: ti.template()):
 @kernel
 def run_elements(m: ti.template()):
     """Run the element loop of a sub-step. scalars: LOWEST_J, INVERTED_NOW, FAILED."""
-    elasticity.sum_elements_with_damping(m)
+    elasticity.sum_elements_with_damping(m, 1)
 
 
 @kernel
@@ -341,4 +337,4 @@ def end_shared(m: ti.template(), s: ti.template(), row: ti.i32, dt: ti.f64, drif
 @kernel
 def find_reactions(m: ti.template(), s: ti.template(), dt: ti.f64):
     """Compute the reactions of the last sub-step of a batch."""
-    compute_reactions(m, s, dt)
+    compute_reactions(m, s, dt, s.n_held)

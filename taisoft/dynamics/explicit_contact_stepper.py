@@ -5,11 +5,25 @@ from dataclasses import replace
 import numpy as np
 
 from taisoft.contact.colouring import colour_contacts
-from taisoft.contact.problem import find_factors
-from taisoft.contact.solve import SolveResult, solve
+from taisoft.contact.solve import SolveResult, result_of, solve, sweeps_per_launch, team_of
 from taisoft.dynamics import explicit
 from taisoft.dynamics.contact import BLOCKED, FREE, MAX_PASSAGES, TOLERANCE, ContactStep
-from taisoft.dynamics.explicit_contact import finish_verlet, move, predict, set_free_velocities
+from taisoft.dynamics.explicit_batch import (
+    ALL_SWEEPS,
+    DEEPEST,
+    DEEPEST_RELATIVE,
+    DONE,
+    FAULT,
+    MOST,
+    N_TALLY,
+    NOT_FOUND,
+    NOT_SOLVED,
+    NOTHING,
+    UNSOLVED,
+    WORST,
+    Batch,
+)
+from taisoft.dynamics.explicit_contact import begin_solve, finish_verlet, move, predict
 from taisoft.dynamics.explicit_stepper import ExplicitStepper
 from taisoft.dynamics.results import StepResult
 from taisoft.dynamics.rigid_contacts import RigidContacts
@@ -35,6 +49,7 @@ class ContactExplicitStepper(ExplicitStepper):
         self.max_batch = min(self.max_batch, MAX_CONTACT_BATCH)
         self.contact_tolerance = settings.contact_tolerance or TOLERANCE[settings.precision]
         self._rigid = RigidContacts(simulation.model) if simulation.model.has_rigid_tets else None
+        self._batch = Batch(simulation, contact, self.work, self.method, self.contact_tolerance)
 
     def forget(self) -> None:
         """Discard the search and impulses, after the state was set."""
@@ -55,7 +70,7 @@ class ContactExplicitStepper(ExplicitStepper):
 
         If a sub-step fails, the state is the one before it.
         """
-        simulation, model, results, depth, done = self.simulation, self.simulation.model, [], 0.0, 0
+        simulation, model, tally, done = self.simulation, self.simulation.model, np.zeros(N_TALLY), 0
         explicit.begin_batch(model)
         n, start = min(n, self.max_batch), simulation.time
         self.good.copy_from(simulation.now)
@@ -66,35 +81,45 @@ class ContactExplicitStepper(ExplicitStepper):
             self.acceleration_stale = self.acceleration_stale or simulation.releases != releases
             n = len(targets)
         self.contact.start_step(start, dt)
-        relative_penetration = 0.0
         try:
             while done < n:
                 if targets is not None:
                     self._upload_targets(targets[done : done + 1])
-                results.append(self._substep(simulation.step_count + done + 1, start + done * dt, dt))
-                depth = max(depth, self.contact.end(start + (done + 1) * dt, dt))
-                relative_penetration = max(relative_penetration, self.contact.relative_penetration)
+                event, is_far = NOTHING, self.contact.is_far(start + done * dt, dt)
+                if not is_far and self._batch.suits():
+                    event = self._take_batch(min(n - done, MOST), start + done * dt, dt, tally)
+                    done = int(tally[DONE])
+                    if event == NOTHING:
+                        continue
+                result = self._substep(simulation.step_count + done + 1, start + done * dt, dt, is_far, event)
+                if result:
+                    tally[ALL_SWEEPS] += result.iterations
+                    tally[UNSOLVED] += not result.converged
+                    tally[WORST] = max(tally[WORST], result.residual)
+                self._deepen(tally, self.contact.end(start + (done + 1) * dt, dt), self.contact.relative_penetration)
                 if done + 1 == n:  # once per batch: it costs about as much as a search
-                    crossing = self.contact.measure_crossings()
-                    depth, relative_penetration = max(depth, crossing[0]), max(relative_penetration, crossing[1])
+                    self._deepen(tally, *self.contact.measure_crossings())
                 done += 1
+                tally[DONE] = done
                 self.contact.end_substep(self.good.x)
                 if done < n:
                     self.good.copy_from(simulation.now)
         except BaseException:  # Ctrl-C, too
             self._return_to_good()
             self.contact.discard()
+            done = int(tally[DONE])
             simulation.step_count += done
             simulation.time = start + done * dt
             raise
-        self.contact.penetration, self.contact.relative_penetration = depth, relative_penetration
+        self.contact.penetration, self.contact.relative_penetration = map(float, tally[[DEEPEST, DEEPEST_RELATIVE]])
+        lowest, most_inverted = model.state.scalars.to_numpy()[[LOWEST_J, MOST_INVERTED]].tolist()
         result = StepResult(
             steps=n,
-            min_volume_ratio=model.state.scalars[LOWEST_J],
-            n_inverted=int(model.state.scalars[MOST_INVERTED]),
-            contact_iterations=sum(r.iterations for r in results if r),
-            contact_residual=max((r.residual for r in results if r), default=0.0),
-            converged=all(r.converged for r in results if r) and not self.contact.paths.held_back,
+            min_volume_ratio=lowest,
+            n_inverted=int(most_inverted),
+            contact_iterations=int(tally[ALL_SWEEPS]),
+            contact_residual=float(tally[WORST]),
+            converged=not tally[UNSOLVED] and not self.contact.paths.held_back,
         )
         if self.contact.paths.held_back:
             result.problems.append(self.contact.paths.held_back)
@@ -102,23 +127,49 @@ class ContactExplicitStepper(ExplicitStepper):
             result.problems.append(f"the contact solver stopped at a residual of {result.contact_residual:.2e}")
         return result
 
-    def _substep(self, step: int, time: float, dt: float) -> SolveResult | None:
+    def _take_batch(self, n: int, time: float, dt: float, tally: np.ndarray) -> int:
+        """Take a batch of up to n sub-steps from a time, and add it to the tally. Return the event that ended it early."""
+        batch = self._batch
+        self._prepare(time)
+        self.contact.search(time, dt)
+        try:
+            batch.run(n, time, dt, self.good, MAX_SWEEPS)
+        finally:  # Ctrl-C, too
+            tally[[DONE, ALL_SWEEPS, UNSOLVED]] += batch.tally[[DONE, ALL_SWEEPS, UNSOLVED]]
+            tally[WORST] = max(tally[WORST], batch.tally[WORST])
+            self._deepen(tally, *batch.tally[[DEEPEST, DEEPEST_RELATIVE]])
+        return batch.event
+
+    def _deepen(self, tally: np.ndarray, depth: float, relative: float) -> None:
+        """Add penetrations to the tally."""
+        tally[DEEPEST], tally[DEEPEST_RELATIVE] = max(tally[DEEPEST], depth), max(tally[DEEPEST_RELATIVE], relative)
+
+    def _prepare(self, time: float) -> None:
+        """Set the loads of a time, and Verlet's acceleration if it is stale."""
+        model, work = self.simulation.model, self.work
+        self.simulation.set_load_time(time)
+        if work.verlet and self.acceleration_stale:
+            explicit.run_elements(model)
+            explicit.find_acceleration(model, work)
+        self.acceleration_stale = False
+
+    def _substep(self, step: int, time: float, dt: float, is_far: bool, event: int) -> SolveResult | None:
         """Take sub-step number `step` from a time, and repeat it while surfaces pass through each other on its paths.
 
+        is_far: whether nothing can touch. event: where a batch has left it, or NOTHING.
         Return the contact solver's result, None without contacts.
         """
         simulation, contact, good = self.simulation, self.contact, self.good
-        is_far = contact.is_far(time, dt)
-        if not is_far:
+        if not is_far and event == NOTHING:
             contact.search(time, dt)
         if not contact.paths.none_cross and contact.measures.closing_ratio > 1.0:
             raise SimulationError(f"step {step}: {contact.measures.describe_fast_closing(dt)}")
         contact.start_substep(dt)
         for tries in range(MAX_PASSAGES + 1):
-            result = self._solve_and_move(step, time, dt, is_far)
-            if is_far and contact.far.stays():
+            result = self._solve_and_move(step, time, dt, is_far, event)
+            if event == NOT_FOUND or (is_far and contact.far.stays()):
                 break
-            is_far = False
+            is_far, event = False, NOTHING
             way = contact.certify(time, dt, good)
             if way == FREE:
                 break
@@ -138,47 +189,53 @@ class ContactExplicitStepper(ExplicitStepper):
         self.simulation.now.copy_history_from(self.good)
         self.simulation.move_branches(dt)
 
-    def _solve_and_move(self, step: int, time: float, dt: float, is_far: bool) -> SolveResult | None:
-        """Solve for the impulses of the contacts found, and move; return the contact solver's result, None without contacts.
-
-        is_far: whether nothing can touch.
-        """
+    def _solve_and_move(self, step: int, time: float, dt: float, is_far: bool, event: int) -> SolveResult | None:
+        """Solve for the impulses of the contacts found, and move, as far as a batch has not done so; the arguments are those of
+        `_substep`. Return the contact solver's result, None without contacts."""
         model, work, contact = self.simulation.model, self.work, self.contact
-        self.simulation.set_load_time(time)
-        if work.verlet and self.acceleration_stale:
-            explicit.run_elements(model)
-            explicit.find_acceleration(model, work)
-        self.acceleration_stale = False
-        n = 0 if is_far else contact.begin(time, dt)
-        predict(model, work, dt)
-        result = None
-        if n:
-            problem = contact.problem
-            set_free_velocities(model, work, problem, dt, *contact.gap_targets)
-            find_factors(problem)
-            if self._rigid is not None:
-                result = self._rigid.solve(problem, self.method, self.contact_tolerance, MAX_SWEEPS)
-            else:
-                if self.method == "coloured_gauss_seidel":
-                    colour_contacts(problem)
-                result = solve(problem, self.method, self.contact_tolerance, MAX_SWEEPS)
-        move(model, work, contact.problem, dt, int(n > 0))
-        self.simulation.move_branches(dt)
-        if work.verlet:
-            self.simulation.set_load_time(time + dt)
-            explicit.run_elements(model)
-            finish_verlet(model, work, contact.problem, dt, int(n > 0))
+        if event < NOT_SOLVED:
+            self._prepare(time)
+            n = 0 if is_far else contact.begin(time, dt)
+            predict(model, work, contact.problem, contact.detection.surface, dt, *contact.gap_targets)
+        else:
+            n = contact.n_contacts
+        result = self._solve(n, event) if n else None
+        if event < FAULT:
+            surface = contact.detection.surface
+            move(model, work, contact.problem, surface, dt, NOTHING)
+            self.simulation.move_branches(dt)
+            if work.verlet:
+                self.simulation.set_load_time(time + dt)
+                finish_verlet(model, work, contact.problem, surface, dt, NOTHING)
         if model.state.scalars[FAILED] != 0.0:
             raise SimulationError(f"step {step}: {self._describe_fault()}")
         return result
 
+    def _solve(self, n: int, event: int) -> SolveResult:
+        """Solve for the impulses of n contacts, as far as a batch has not done so."""
+        problem, method, tolerance = self.contact.problem, self.method, self.contact_tolerance
+        if self._rigid is not None:
+            return self._rigid.solve(problem, method, tolerance, MAX_SWEEPS)
+        team, is_parallel = team_of(problem, method, n)
+        if is_parallel:
+            colour_contacts(problem)
+            return solve(problem, method, tolerance, MAX_SWEEPS)
+        if event < NOT_SOLVED:
+            sweeps = min(MAX_SWEEPS, sweeps_per_launch(n))
+            begin_solve(problem, team, self.contact.detection.surface, method, tolerance, sweeps, MAX_SWEEPS, NOTHING)
+        found = result_of(problem.sweep.state.to_numpy(), tolerance)
+        if found.converged or found.iterations >= MAX_SWEEPS:
+            return found
+        return solve(problem, method, tolerance, MAX_SWEEPS, is_begun=True)
+
     @property
     def field_bytes(self) -> dict[str, int]:
         """Bytes by name of the contact problem of rigid bodies."""
-        return super().field_bytes | (self._rigid.field_bytes if self._rigid else {})
+        return super().field_bytes | self._batch.field_bytes | (self._rigid.field_bytes if self._rigid else {})
 
     def release(self) -> None:
         """Free its memory."""
         super().release()
+        self._batch.release()
         if self._rigid:
             self._rigid.release()

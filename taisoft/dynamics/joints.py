@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 @kernel
 def _own_forces(m: ti.template(), f: ti.template()):
     """Forces of tets, with stiffness damping, and of loads on the dependent nodes (n) [N], without weight."""
-    sum_elements_with_damping(m)
+    sum_elements_with_damping(m, 1)
     ti.loop_config(serialize=m.serial)
     for k in range(m.dependents.n):
         total = ti.Vector([0.0, 0.0, 0.0], m.real)

@@ -135,8 +135,11 @@ def prepare_terms(m: ti.template()):
 
 
 @ti.func
-def sum_elements_with_damping(m: ti.template()):
-    """As `sum_elements` over all blocks, with stiffness damping if it is on. scalars: LOWEST_J, INVERTED_NOW, FAILED."""
+def sum_elements_with_damping(m: ti.template(), counts):
+    """As `sum_elements` over all blocks, with stiffness damping if it is on.
+
+    counts: 1 to update the scalars LOWEST_J, INVERTED_NOW and FAILED, else 0.
+    """
     place_all(m)
     find_dilatations(m)
     if ti.static(m.stiffness_damping):
@@ -150,7 +153,7 @@ def sum_elements_with_damping(m: ti.template()):
                 m.state.partial[task // m.spread, SUM] = ti.cast(low, ti.f64)
                 m.state.partial[task // m.spread, OTHER_SUM] = ti.cast(count, ti.f64)
         ti.loop_config(serialize=True)
-        for c in range(m.chunks):
+        for c in range(counts * m.chunks):
             low = m.state.partial[c, SUM]
             m.state.scalars[LOWEST_J] = ti.min(m.state.scalars[LOWEST_J], low)
             m.state.scalars[INVERTED_NOW] = m.state.scalars[INVERTED_NOW] + m.state.partial[c, OTHER_SUM]
@@ -160,7 +163,8 @@ def sum_elements_with_damping(m: ti.template()):
         for g in ti.static(m.groups):
             for b in range(g.first, g.last):
                 J = element_force(m, g, m.stiffness_damping, b)
-                record_volumes(m, J, count_inverted(m, b, J))
+                if counts == 1:
+                    record_volumes(m, J, count_inverted(m, b, J))
     prepare_terms(m)
 
 

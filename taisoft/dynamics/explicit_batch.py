@@ -1,0 +1,155 @@
+"""Batches of explicit sub-steps with contacts, which the host only launches: it reads nothing before their end.
+
+Eight launches are a sub-step: fill the contact problem from the last search, predict, solve, move (Verlet: and kick again), check
+the paths, search at the end, and accept. What the host would have to decide is an event: it stops the batch, so that later
+launches do nothing, and the host takes over there, by the code of single sub-steps. No sub-step is accepted without the check of
+its paths. In scenes where only half-spaces, spheres and capsules at rest can be touched, by bodies without rigid parts, dependent
+or prescribed nodes and Maxwell branches, under loads that do not change. Others take single sub-steps.
+"""
+
+
+import numpy as np
+import taichi as ti
+
+from taisoft.backend.arrays import FieldArena
+from taisoft.backend.runtime import kernel
+from taisoft.collision.reduction import FOUND, LEFT
+from taisoft.collision.surface import EVENT, GO
+from taisoft.contact.build import NODES, fill, finish_contacts
+from taisoft.contact.problem import RESIDUAL, SWEEPS
+from taisoft.contact.solve import MOST_OF_TEAM, sweeps_per_launch, team_of
+from taisoft.dynamics.contact import ContactStep
+from taisoft.dynamics.explicit_contact import begin_solve, finish_verlet, move, predict
+from taisoft.dynamics.explicit_stepper import SubstepWork
+from taisoft.dynamics.simulation_state import SimulationState
+from taisoft.dynamics.state import StepState
+
+MOST = 32  # sub-steps of a batch
+NOTHING, NOT_SOLVED, FAULT, NOT_FREE, NOT_FOUND = range(5)  # events, in the order in which a sub-step may meet them
+# Indices into the tally: sub-steps accepted, sweeps in them, largest residual, solves that did not converge, deepest penetration
+# [m], and over the finer side's edge; contacts found by the search before the last one and by the last one, and those kept
+DONE, ALL_SWEEPS, WORST, UNSOLVED, DEEPEST, DEEPEST_RELATIVE, FOUND_BEFORE, FOUND_LAST, KEPT_LAST, N_TALLY = range(10)
+
+
+@kernel
+def begin_tally(s: ti.template(), tally: ti.template(), found: ti.i32, kept: ti.i32):
+    """Begin a batch, after a search that found and kept so many contacts."""
+    ti.loop_config(serialize=True)
+    for _ in range(1):
+        s.run[GO], s.run[EVENT] = 1, NOTHING
+        for k in ti.static(range(FOUND_BEFORE)):
+            tally[k] = 0.0
+        tally[FOUND_BEFORE] = tally[FOUND_LAST] = found
+        tally[KEPT_LAST] = kept
+
+
+@kernel
+def run_on(s: ti.template()):
+    """Let kernels work again after the end of a batch."""
+    ti.loop_config(serialize=True)
+    for _ in range(1):
+        s.run[GO] = 1
+
+
+@kernel
+def accept(
+    m: ti.template(),
+    p: ti.template(),
+    s: ti.template(),
+    found: ti.template(),
+    reduction: ti.template(),
+    good_x: ti.template(),
+    good_v: ti.template(),
+    good_slip: ti.template(),
+    slip: ti.template(),
+    tally: ti.template(),
+    dt: ti.f64,
+    tolerance: ti.f64,
+):
+    """Accept a sub-step of dt [s]: end its contacts, copy the state to the good one, and add to the tally."""
+    finish_contacts(p, m, good_x, slip, dt, s.run[GO])
+    ti.loop_config(serialize=m.serial)
+    for i in range(s.run[GO] * m.n_nodes):
+        good_x[i], good_v[i], good_slip[i] = m.state.x[i], m.state.v[i], slip[i]
+    ti.loop_config(serialize=p.team.alone, block_dim=p.team.threads)
+    for t in range(p.team.threads):
+        depth, relative = ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64)
+        for j in range(p.team.share(t, reduction.count[LEFT])):
+            at = reduction.kept[p.team.term(t, j)]
+            depth = ti.max(depth, -found.gap[at])
+            relative = ti.max(relative, -found.gap[at] / ti.min(s.edge[found.body[at][0]], s.edge[found.body[at][1]]))
+        depth, relative = p.team.largest(t, depth), p.team.largest(t, relative)
+        if t == 0 and s.run[GO] == 1:
+            tally[DONE] += 1.0
+            if p.count[0] > 0:
+                residual = p.sweep.state[RESIDUAL]
+                tally[ALL_SWEEPS] += p.sweep.state[SWEEPS]
+                tally[WORST] = ti.max(tally[WORST], residual)
+                tally[UNSOLVED] += ti.cast(not residual <= tolerance, ti.f64)
+            tally[DEEPEST], tally[DEEPEST_RELATIVE] = ti.max(tally[DEEPEST], depth), ti.max(tally[DEEPEST_RELATIVE], relative)
+            tally[FOUND_BEFORE], tally[FOUND_LAST] = tally[FOUND_LAST], reduction.count[FOUND]
+            tally[KEPT_LAST] = reduction.count[LEFT]
+
+
+class Batch:
+    """Batches of sub-steps of one simulation. tally: of the last one; event: that has ended it early, or NOTHING."""
+
+    def __init__(self, simulation: SimulationState, contact: ContactStep, work: SubstepWork, method: str, tolerance: float):
+        self._simulation, self._contact, self._work = simulation, contact, work
+        self._method, self._tolerance, self._arena = method, tolerance, FieldArena()
+        self._tally = self._arena.field("batch_tally", ti.f64, N_TALLY)
+        self.tally, self.event = np.zeros(N_TALLY), NOTHING
+        m = simulation.model
+        is_plain = not (m.viscous or m.has_rigid_tets or m.has_dependents or work.has_prescribed or simulation.ramp)
+        self._suits = is_plain and contact.detection.only_shapes
+
+    def suits(self) -> bool:
+        """Return whether the next sub-steps may be a batch."""
+        simulation, contact = self._simulation, self._contact
+        knows = simulation.now.none_cross and not len(simulation.now.held.pairs) and not contact.has_paths
+        return self._suits and knows and not simulation.loads.vary and contact.detection.counts.contacts <= MOST_OF_TEAM
+
+    def run(self, n: int, time: float, dt: float, good: StepState, max_sweeps: int) -> None:
+        """Take up to n sub-steps of dt [s], after a search at their time.
+
+        good: the state at the start, which becomes that after the last sub-step accepted. The tally is read in any case.
+        """
+        contact, detection = self._contact, self._contact.detection
+        contact.begin_batch()
+        begin_tally(detection.surface, self._tally, detection.counts.found, detection.counts.contacts)
+        try:
+            for k in range(n):
+                self._launch(k, time + k * dt, dt, good, max_sweeps)
+        finally:  # Ctrl-C, too
+            self.tally, self.event = self._tally.to_numpy(), int(detection.surface.run[EVENT])
+            if self.event != NOTHING:
+                run_on(detection.surface)
+            counts = (int(self.tally[k]) for k in (FOUND_BEFORE, FOUND_LAST, KEPT_LAST))
+            contact.end_batch(time + self.tally[DONE] * dt, dt, *counts, self.event == NOTHING)
+
+    def _launch(self, k: int, time: float, dt: float, good: StepState, max_sweeps: int) -> None:
+        """Launch sub-step k of the batch."""
+        model, contact, work, detection = self._simulation.model, self._contact, self._work, self._contact.detection
+        p, s, search = contact.problem, detection.surface, (detection.surface, detection.shapes)
+        warm, offset, n = contact.warm_factor(dt) if k == 0 else 1.0, contact.contact_offset, detection.counts.contacts
+        fill(p, model, *search, contact.numbers, detection.buffer.data, detection.reduction, -1, dt, warm, offset, 1)
+        predict(model, work, p, s, dt, *contact.gap_targets)
+        solve = self._method, self._tolerance, min(max_sweeps, sweeps_per_launch(n)), max_sweeps
+        begin_solve(p, team_of(p, self._method, n)[0], s, *solve, NOT_SOLVED)
+        move(model, work, p, s, dt, FAULT)
+        if work.verlet:
+            finish_verlet(model, work, p, s, dt, FAULT)
+        detection.paths.check_in_batch(model.state.x, NOT_FREE)
+        room = min(p.capacity - 1, p.node.shape[0] // (NODES * model.most_masters))
+        detection.search_shapes(detection.motion(time + dt, dt), True, room, NOT_FOUND)
+        state = good.x, good.v, good.slip, self._simulation.now.slip
+        accept(model, p, s, detection.buffer.data, detection.reduction, *state, self._tally, dt, self._tolerance)
+
+    @property
+    def field_bytes(self) -> dict[str, int]:
+        """Bytes by name."""
+        return self._arena.bytes
+
+    def release(self) -> None:
+        """Free the memory."""
+        self._arena.release()
