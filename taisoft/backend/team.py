@@ -22,6 +22,7 @@ from typing import Any
 import taichi as ti
 
 from taisoft.backend.arrays import FieldArena, on_cuda
+from taisoft.backend.lists import part_first
 from taisoft.backend.paths import team_order
 
 GPU_THREADS = 1024  # of a block
@@ -128,6 +129,28 @@ class Team:
 
 
 ALONE = Team()
+
+
+@ti.func
+def keep_marked(team: ti.template(), t, items: ti.template(), marks: ti.template(), scratch: ti.template(), n):
+    """Leave out of items[:n] those whose mark is not 1, in order, by all threads t of a team. Return the number of others.
+
+    scratch: room for n items.
+    """
+    first, last, own = part_first(t, n, team.threads), part_first(t + 1, n, team.threads), 0
+    for k in range(first, last):
+        own += int(marks[k] == 1)
+    at = ti.cast(team.before(t, ti.cast(own, ti.f64)), ti.i32)
+    for k in range(first, last):
+        if marks[k] == 1:
+            scratch[at] = items[k]
+            at += 1
+    left = ti.cast(team.total(t, ti.cast(own, ti.f64)), ti.i32)
+    for j in range(team.share(t, left)):
+        k = team.entry(t, j, left)
+        items[k] = scratch[k]
+    team.sync()
+    return left
 
 
 def make_team(arena: FieldArena, name: str) -> Team:

@@ -73,12 +73,12 @@ def _fill_cells(work: ti.template(), out: ti.template(), inverse, lowest_gap):
     """Number the contacts over all parts, drop those between surfaces whose gap is lower, and enter the others into the cells."""
     ti.loop_config(serialize=True)
     for _ in range(1):
-        mask = 63
-        while mask + 1 < out.count[TOTAL]:
-            mask = 2 * mask + 1
-        work.count[FOUND], work.count[MASK] = out.count[TOTAL], mask
+        found, mask = out.count[TOTAL], 63
         if out.count[NEEDED] > out.part:  # a truncated list is never used
-            work.count[FOUND] = 0
+            found = 0
+        while mask + 1 < found:
+            mask = 2 * mask + 1
+        work.count[FOUND], work.count[MASK] = found, mask
     clear_counts(work.lists, work.count[MASK] + 1)
     ti.loop_config(serialize=work.serial)
     for task in range(out.chunks * work.spread):
@@ -171,6 +171,8 @@ def _decide_rest(work: ti.template(), out: ti.template(), inverse, tolerance, t)
         for j in range(team.share(t, n)):
             left += ti.cast(_try(work, out, work.place[team.entry(t, j, n)], inverse, tolerance), ti.f64)
         left = team.total(t, left)
+    if t == 0:
+        work.count[UNDECIDED] = 0
 
 
 @ti.func

@@ -12,6 +12,7 @@ import taichi as ti
 from taisoft.backend.arrays import FieldArena
 from taisoft.backend.lists import add_up_counts, clear_counts, count_entries, keys_if
 from taisoft.backend.runtime import kernel
+from taisoft.backend.team import keep_marked
 from taisoft.collision.reduction import LEFT
 from taisoft.collision.surface import GO
 from taisoft.contact.past import keep_impulses, load_of, warm_impulse
@@ -153,26 +154,38 @@ def relative_velocity(p: ti.template(), m: ti.template(), c, dt):
 
 @kernel
 def drop_vanishing(
-    p: ti.template(), m: ti.template(), s: ti.template(), found: ti.template(), kept: ti.template(), n: ti.i32, first: ti.i32
+    p: ti.template(),
+    m: ti.template(),
+    s: ti.template(),
+    found: ti.template(),
+    kept: ti.template(),
+    n: ti.i32,
+    slot: ti.i32,
+    first: ti.i32,
 ) -> ti.i32:
     """Leave out of kept[:n] the contacts whose weights cancel, since both sides depend on the same nodes.
 
-    Entries from `first` on are overwritten, and there must be room for one more contact than the problem has. Returns the number
-    of contacts left.
+    The rows of n contacts from `slot` on, with entries from `first` on, are overwritten, and `renewal`. Returns the number of
+    contacts left.
     """
+    clear_counts(p.room, n)
+    ti.loop_config(serialize=p.serial)
+    for c in range(n):
+        count_entries(p.room, c, _room(m, found, kept[c]))
+    add_up_counts(p.room, n)
+    ti.loop_config(serialize=p.serial)
+    for c in range(n):
+        own, largest = slot + c, ti.cast(0.0, ti.f64)
+        _add_sides(p, m, s, own, first + p.room.start[c + 1], found, kept[c])
+        for e in range(p.first[own], p.first[own] + p.arity[own]):
+            largest = ti.max(largest, ti.abs(p.weight[e]))
+        p.renewal.match[c] = int(p.arity[own] == 0 or largest > VANISHING)
     left = 0
-    ti.loop_config(serialize=True)
-    for _ in range(1):
-        free = p.count[0]
-        for c in range(n):
-            row = kept[c]
-            _add_sides(p, m, s, free, first, found, row)
-            largest = ti.cast(0.0, ti.f64)
-            for e in range(first, first + p.arity[free]):
-                largest = ti.max(largest, ti.abs(p.weight[e]))
-            if p.arity[free] == 0 or largest > VANISHING:
-                kept[left] = row
-                left += 1
+    ti.loop_config(serialize=p.team.alone, block_dim=p.team.threads)
+    for t in range(p.team.threads):
+        n_left = keep_marked(p.team, t, kept, p.renewal.match, p.renewal.fate, n)
+        if t == 0:
+            left += n_left
     return left
 
 
@@ -280,17 +293,16 @@ def has_impact(p: ti.template(), rigid: ti.template(), dt: ti.f64, contact_offse
     stops the body in this one: an impulse then does not tell that the impact is over, only the approach does.
     """
     found = 0
-    ti.loop_config(serialize=True)
-    for _ in range(1):
-        for c in range(p.count[0]):
-            closes = p.gap[c] - contact_offset_of(p, c, contact_offset) + dt * p.approach[c] < 0.0
-            stops = p.r[c][0] == 0.0 and p.approach[c] < 0.0
-            if p.area[c] > 0.0:  # where points carry the load of the pair, a mean comes and goes without an impact
-                stops = stops and p.load[c] == 0.0
-            if rigid[p.body[c][0]] + rigid[p.body[c][1]] > 0:
-                stops = stops or dt * p.approach[c] < -STILL * contact_offset
-            if stops and closes:
-                found = 1
+    ti.loop_config(serialize=p.serial)
+    for c in range(p.count[0]):
+        closes = p.gap[c] - contact_offset_of(p, c, contact_offset) + dt * p.approach[c] < 0.0
+        stops = p.r[c][0] == 0.0 and p.approach[c] < 0.0
+        if p.area[c] > 0.0:  # where points carry the load of the pair, a mean comes and goes without an impact
+            stops = stops and p.load[c] == 0.0
+        if rigid[p.body[c][0]] + rigid[p.body[c][1]] > 0:
+            stops = stops or dt * p.approach[c] < -STILL * contact_offset
+        if stops and closes:
+            ti.atomic_max(found, 1)
     return found
 
 

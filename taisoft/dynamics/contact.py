@@ -296,7 +296,7 @@ class ContactStep:
             self._allocate(*room)
         problem = self.problem
         if model.has_dependents and n:
-            n = drop_vanishing(problem, model, surface, found, kept, n, 0)  # the past's entries are needed no more
+            n = drop_vanishing(problem, model, surface, found, kept, n, 0, 0)  # the past's entries are needed no more
         indexes = int(n > 0 or self._indexed)  # an empty index needs no update
         what = model, surface, shapes, self.numbers, found, self.detection.reduction
         fill(problem, *what, n, dt, self.warm_factor(dt), self.contact_offset, indexes)

@@ -7,7 +7,6 @@ its paths. In scenes where only half-spaces, spheres and capsules at rest can be
 or prescribed nodes and Maxwell branches, under loads that do not change. Others take single sub-steps.
 """
 
-
 import numpy as np
 import taichi as ti
 

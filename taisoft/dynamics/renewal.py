@@ -58,7 +58,7 @@ class Renewal:
         model, detection, end = self._model, self._detection, self._found
         s, shapes, (surface, found, kept, n) = detection.surface, detection.shapes, end.found
         if model.has_dependents and n:
-            n = drop_vanishing(problem, model, s, found, kept, n, problem.count[2])
+            n = drop_vanishing(problem, model, s, found, kept, n, problem.count[0], problem.count[2])
         lengths = dt, offset, detection.margin, detection.floor
         if not judge(problem, s, surface, shapes, x_start, displacement, found, kept, n, *lengths):
             return False
