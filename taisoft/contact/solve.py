@@ -4,20 +4,7 @@ On a CPU the team is one thread, which is faster: it takes 0.06 us per contact a
 start, a sweep has two to twenty of them, and memory bandwidth limits two threads to little more than the speed of one. On a GPU
 it is a block, since a launch for each colour takes longer than its contacts; only large problems use all threads.
 A team leaves out, until the next residual check, the contacts that a check after the first finds open.
-
-Nesterov momentum follows any kind of sweep. The next one starts from the extrapolated impulses
-    y = prox(x + (t - 1)/t' (x - x_before)),   t' = (1 + sqrt(1 + 4 t^2)) / 2,
-and t is reset to 1 if the sweep from y went backwards, (y - x).F^-1 (x - x_before) > 0, F the r-factors. With friction the
-problem is not a minimisation, so convergence is not guaranteed; the r-factor strategy restores the best impulses after a failure.
-On the problems of Siconos' collection Gauss-Seidel with momentum reaches 1e-6 in 20 to 670 sweeps; without, it is at 3e-5 after
-1000.
-
-The r-factor strategy adapts the fraction of the r-factors that a sweep uses, from 1 at the start. A residual check after some
-sweeps saves the impulses if they are the best so far and lets the fraction recover. If the residual exceeds MAX_GROWTH times the
-best one, or has not improved for PATIENCE sweeps, the best impulses are restored and the fraction is lowered, but never below
-MIN_FRACTION: a fraction that tends to zero would look like convergence (report, algorithm 2, lines 12 to 16). Smaller growth is
-accepted: neither Gauss-Seidel nor momentum is monotone, and restoring costs more than waiting.
-Sources: Nesterov 1983; O'Donoghue and Candes 2015 for the restart.
+Momentum and the strategy of the r-factors, see `strategy`, follow any kind of sweep.
 """
 
 from dataclasses import dataclass, field
@@ -28,36 +15,22 @@ import taichi as ti
 from taisoft.backend.runtime import kernel
 from taisoft.backend.team import ALONE, Team
 from taisoft.contact.problem import (
-    AGE,
     BEST,
     CHECKS,
     CHUNKS,
     HISTORY,
-    MOMENTUM,
     RESIDUAL,
-    STEP,
     SWEEPS,
-    VERDICT,
-    WEIGHT,
     ContactProblem,
     find_velocities,
-    natural_map,
-    residual_of,
     set_velocities,
 )
-from taisoft.contact.prox import prox
+from taisoft.contact.strategy import apply_verdict, judge, move_on, residual_terms, restart_test, set_weight
 from taisoft.contact.sweeps import SIMULTANEOUS, relaxation, sweep, sweep_parallel
 
 LAUNCH_VISITS = 1_000_000  # contact visits per launch: about 0.1 s, so that Ctrl-C takes effect
 MOST_OF_TEAM = 30_000  # contacts from which all threads of a GPU share a sweep
 CHECK_EVERY = 5  # sweeps between residual checks, each of which costs as much as a sweep
-# Sums of powers of two: the same numbers in f32 and f64
-SHRINK = 0.75  # of the fraction when impulses are restored
-RECOVER = 1.125  # of the fraction when the residual falls
-MIN_FRACTION = 0.0078125
-MAX_GROWTH = 10.0
-PATIENCE = 200.0  # sweeps
-SAVE, CONTINUE, RESTORE = range(3)  # verdicts
 
 
 @dataclass(frozen=True)
@@ -159,14 +132,14 @@ def _check(problem: ti.template(), team: ti.template(), t, first, sweeps):
     """Check the residual and save or restore the impulses; w must be up to date."""
     n, sums = problem.count[0], ti.Vector([0.0, 0.0], ti.f64)
     for j in range(team.share(t, n)):
-        sums += _residual_terms(problem, team.term(t, j), first)
+        sums += residual_terms(problem, team.term(t, j), first)
     for k in ti.static(range(2)):
         sums[k] = team.total(t, sums[k])
     if t == 0:
-        _judge(problem, sums, first, sweeps)
+        judge(problem, sums, first, sweeps)
     team.sync()
     for j in range(team.share(t, n)):
-        _apply_verdict(problem, team.entry(t, j, n))
+        apply_verdict(problem, team.entry(t, j, n))
     team.sync()
 
 
@@ -175,13 +148,13 @@ def _extrapolate(problem: ti.template(), team: ti.template(), t):
     """Set the impulses from which the next sweep starts."""
     n, backwards = problem.count[0], ti.cast(0.0, ti.f64)
     for j in range(team.share(t, n)):
-        backwards += _restart_test(problem, team.term(t, j))
+        backwards += restart_test(problem, team.term(t, j))
     backwards = team.total(t, backwards)
     if t == 0:
-        _set_weight(problem, backwards)
+        set_weight(problem, backwards)
     team.sync()
     for j in range(team.share(t, n)):
-        _move_on(problem, team.entry(t, j, n))
+        move_on(problem, team.entry(t, j, n))
     team.sync()
 
 
@@ -281,29 +254,26 @@ def _prepare_all(problem: ti.template(), method: ti.template(), with_momentum: t
 def _check_all(problem: ti.template(), first: ti.i32, sweeps: ti.i32):
     """As `_check`."""
     for c in range(problem.count[0]):
-        problem.sweep.term[c] = _residual_terms(problem, c, first)
+        problem.sweep.term[c] = residual_terms(problem, c, first)
     _sum_chunks(problem)
     ti.loop_config(serialize=True)
     for _ in range(1):
-        _judge(problem, _total(problem), first, sweeps)
+        judge(problem, _total(problem), first, sweeps)
     for c in range(problem.count[0]):
-        _apply_verdict(problem, c)
+        apply_verdict(problem, c)
 
 
 @kernel
 def _extrapolate_all(problem: ti.template()):
     """As `_extrapolate`."""
     for c in range(problem.count[0]):
-        problem.sweep.term[c] = [_restart_test(problem, c), 0.0]
+        problem.sweep.term[c] = [restart_test(problem, c), 0.0]
     _sum_chunks(problem)
     ti.loop_config(serialize=True)
     for _ in range(1):
-        _set_weight(problem, _total(problem)[0])
+        set_weight(problem, _total(problem)[0])
     for c in range(problem.count[0]):
-        _move_on(problem, c)
-
-
-# --- of one contact -------------------------------------------------------------------------------------------------------
+        move_on(problem, c)
 
 
 @ti.func
@@ -311,107 +281,3 @@ def _prepare(problem: ti.template(), c, method: ti.template(), with_momentum):
     """Set the fraction of the r-factors and the impulse of contact c before the first sweep."""
     problem.sweep.relaxation[c] = relaxation(problem, c, method, with_momentum)
     problem.sweep.previous[c] = problem.r[c]
-
-
-@ti.func
-def _residual_terms(problem: ti.template(), c, first):
-    """`natural_map` of contact c; find out whether it is idle, unless it is the first check."""
-    found = natural_map(problem, c)
-    problem.sweep.idle[c] = int(first == 0 and (found == 0.0).all())
-    return found
-
-
-@ti.func
-def _move_on(problem: ti.template(), c):
-    """Extrapolate the impulse of contact c by the weight."""
-    x = problem.r[c]
-    problem.r[c] = prox(x + problem.sweep.state[WEIGHT] * (x - problem.sweep.previous[c]), problem.friction[c])
-    problem.sweep.previous[c] = x
-
-
-# --- momentum ---------------------------------------------------------------------------------------------------------
-
-
-@ti.func
-def _restart_test(problem: ti.template(), c):
-    """Contribution of contact c to (y - x).F^-1 (x - x_before): y is `sweep_start`, x is `r`, x_before is `previous`."""
-    x, f = problem.r[c], problem.factor[c]
-    backward, forward = problem.sweep.sweep_start[c] - x, x - problem.sweep.previous[c]
-    n = ti.select(f[0] > 0.0, 1.0 / f[0], 0.0)
-    t = ti.select(f[1] > 0.0, 1.0 / f[1], 0.0)
-    return n * backward[0] * forward[0] + t * (backward[1] * forward[1] + backward[2] * forward[2])
-
-
-@ti.func
-def _set_weight(problem: ti.template(), total):
-    """Set the weight to (t - 1)/t' times the strategy's fraction, or 0 to restart. total: sum of `_restart_test`."""
-    t = problem.sweep.state[MOMENTUM]
-    problem.sweep.state[MOMENTUM], problem.sweep.state[WEIGHT] = 1.0, 0.0
-    if not total > 0.0:
-        problem.sweep.state[MOMENTUM] = 0.5 * (1.0 + ti.sqrt(1.0 + 4.0 * t * t))
-        problem.sweep.state[WEIGHT] = problem.sweep.state[STEP] * (t - 1.0) / problem.sweep.state[MOMENTUM]
-
-
-# --- r-factor strategy ------------------------------------------------------------------------------------------------
-
-
-@ti.func
-def _judge(problem: ti.template(), sums, first, sweeps):
-    """Set the residual and the verdict from the sums of `natural_map` over the contacts."""
-    problem.sweep.state[RESIDUAL] = residual_of(sums)
-    if first == 1:
-        _begin(problem)
-    else:
-        _accept_or_reject(problem, sweeps)
-
-
-@ti.func
-def _begin(problem: ti.template()):
-    """Initialise a solve; state[RESIDUAL] is that of the initial impulses, the first best ones.
-
-    If it is 1 or more, they are no better than zero impulses and are not saved. (A first sweep from zero yields small impulses,
-    whose residual can be far above 1, since it is relative to them.)
-    """
-    problem.sweep.state[BEST], problem.sweep.state[STEP], problem.sweep.state[SWEEPS] = problem.sweep.state[RESIDUAL], 1.0, 0.0
-    if not problem.sweep.state[RESIDUAL] < 1.0:
-        problem.sweep.state[BEST] = ti.cast(ti.math.inf, ti.f64)
-    problem.sweep.state[AGE], problem.sweep.state[MOMENTUM], problem.sweep.state[VERDICT] = 0.0, 1.0, SAVE
-    _record(problem)
-
-
-@ti.func
-def _record(problem: ti.template()):
-    """Append state[RESIDUAL] to the history of this launch."""
-    k = ti.cast(problem.sweep.state[CHECKS], ti.i32)
-    if k < HISTORY:
-        problem.sweep.history[k] = problem.sweep.state[RESIDUAL]
-    problem.sweep.state[CHECKS] += 1.0
-
-
-@ti.func
-def _accept_or_reject(problem: ti.template(), sweeps):
-    """Set state[VERDICT] from state[RESIDUAL] after the given number of sweeps."""
-    residual, best = problem.sweep.state[RESIDUAL], problem.sweep.state[BEST]
-    _record(problem)
-    problem.sweep.state[SWEEPS] += sweeps
-    problem.sweep.state[AGE] += sweeps
-    problem.sweep.state[VERDICT] = CONTINUE
-    if residual < best:
-        problem.sweep.state[VERDICT] = SAVE
-        problem.sweep.state[BEST], problem.sweep.state[AGE] = residual, 0.0
-        problem.sweep.state[STEP] = ti.min(1.0, RECOVER * problem.sweep.state[STEP])
-    elif not (residual <= MAX_GROWTH * best and problem.sweep.state[AGE] <= PATIENCE):  # also if the residual is not a number
-        problem.sweep.state[VERDICT] = RESTORE
-        problem.sweep.state[RESIDUAL], problem.sweep.state[AGE], problem.sweep.state[MOMENTUM] = best, 0.0, 1.0
-        problem.sweep.state[STEP] = ti.max(MIN_FRACTION, SHRINK * problem.sweep.state[STEP])
-
-
-@ti.func
-def _apply_verdict(problem: ti.template(), c):
-    """Save or restore the impulse of contact c by the verdict."""
-    if problem.sweep.state[VERDICT] == SAVE:
-        problem.sweep.best[c] = problem.r[c]
-    elif problem.sweep.state[VERDICT] == RESTORE:
-        problem.sweep.idle[c] = 0
-        problem.r[c] = problem.sweep.best[c]
-        problem.sweep.previous[c] = problem.sweep.best[c]
