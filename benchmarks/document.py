@@ -8,6 +8,8 @@ import re
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, is_dataclass
 from datetime import datetime
+from functools import partial
+from itertools import groupby
 from pathlib import Path
 
 import numpy as np
@@ -47,7 +49,6 @@ class Document:
         """Write the numbers to `out`, a .json file, and the page beside it. Raises OutputError."""
         write_bytes(out, compact_text(plain(numbers)).encode())
         write_bytes(out.with_suffix(".md"), self.text().encode())
-        print(f"written: {out} and {out.with_suffix('.md').name}")
 
     def finish(
         self, options: argparse.Namespace, numbers: dict, limits: Sequence["Limit"] = (), draw: Callable | None = None
@@ -62,6 +63,7 @@ class Document:
             chosen = {name: value for name, value in vars(options).items() if name in ("arch", "precision", "quick")}
             numbers = chosen | {"load_at_the_end": load_average()} | numbers
             self.write(options.out, numbers | {"limits": list(limits)})
+            print(f"written: {options.out} and {options.out.with_suffix('.md').name}")
         if draw and options.plot:
             draw(options.plot)
             print(f"written: {options.plot}")
@@ -157,6 +159,21 @@ def table(rows: Iterable, columns: Columns, notes: Iterable[str] = ()) -> str:
     text = tables.table(rows, columns)
     bullets = "".join(f"\n* {note}" for note in notes)
     return f"{text}\n{bullets}" if bullets else text
+
+
+def rows_table(rows: Iterable[dict]) -> str:
+    """Tables of rows whose keys are the titles, a new table where these change; texts are on the left."""
+
+    def cell(title: str, row: dict) -> str:
+        value = row[title]
+        whole = isinstance(value, int) or (isinstance(value, float) and 1e3 <= abs(value) < 1e7)
+        return value if isinstance(value, str) else f"{value:,.0f}" if whole else f"{value:.3g}"
+
+    tables_of = (list(alike) for _, alike in groupby(rows, tuple))
+    return "\n\n".join(
+        table(alike, [("<" * isinstance(value, str) + title, partial(cell, title)) for title, value in alike[0].items()])
+        for alike in tables_of
+    )
 
 
 def ms(seconds: float) -> str:
@@ -255,3 +272,17 @@ def earlier_numbers(path: Path | None) -> dict | None:
         return None if path is None else json.loads(path.read_text())
     except (OSError, ValueError):
         return None
+
+
+def newest(results: Path, benchmark: str, arch: str = "") -> dict:
+    """The newest results of a full run of a benchmark, on an arch if one is given. Raises OutputError without any."""
+    found = []
+    for path in sorted(results.glob(f"{benchmark}-*.json")):
+        try:
+            found.append(json.loads(path.read_text(encoding="utf-8")))
+        except (OSError, ValueError) as error:
+            raise OutputError(f"{path} cannot be read: {error}") from error
+    found = [numbers for numbers in found if not numbers.get("quick") and arch in ("", numbers.get("arch"))]
+    if not found:
+        raise OutputError(f"{results} holds no results of `taisoft bench {benchmark}`")
+    return max(found, key=lambda numbers: numbers["date"])

@@ -23,7 +23,7 @@ from .runner import make_parser, progress
 
 BENCHMARKS = (
     *("references", "elasticity", "collision", "contact", "order", "scaling", "peers", "hard", "report", "startup", "launches"),
-    *("gym", "laws", "pictures", "window"),
+    *("gym", "laws", "pictures", "window", "gpu"),
 )
 ENDINGS = {"order": (".json", ".png"), "scaling": (".json", ".png"), "report": ("",)}  # of files; a folder has none; else .json
 NO_QUICK = ("references",)

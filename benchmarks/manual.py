@@ -7,7 +7,6 @@ from the newest results of a benchmark, so that no measured number is typed by h
 with --check if a page differs from the results.
 """
 
-import json
 import re
 import sys
 from collections.abc import Callable
@@ -19,8 +18,7 @@ from taisoft.files import write_bytes
 from taisoft.output.tables import markdown
 from taisoft.view.window.keys import KEYS, MOUSE
 
-from .cuda_check import TABLES as GPU_TABLES
-from .document import RESULTS, table
+from .document import RESULTS, newest, rows_table, table
 from .error import Row as ErrorRow
 from .error import row_table
 from .hard_cases import CASES
@@ -42,20 +40,6 @@ DOCS = Path(__file__).resolve().parents[1] / "docs"
 BLOCK = re.compile(r"(<!-- begin (\w+) -->\n).*?(<!-- end \2 -->\n)", re.DOTALL)
 MARKER = re.compile(r"<!-- (?:begin|end) (\w+) -->")
 ORDERS = {1: "linear", 2: "quadratic"}
-
-
-def newest(results: Path, benchmark: str) -> dict:
-    """The newest results of a full run of a benchmark. Raises OutputError without any."""
-    found = []
-    for path in sorted(results.glob(f"{benchmark}-*.json")):
-        try:
-            found.append(json.loads(path.read_text(encoding="utf-8")))
-        except (OSError, ValueError) as error:
-            raise OutputError(f"{path} cannot be read: {error}") from error
-    found = [numbers for numbers in found if not numbers.get("quick")]
-    if not found:
-        raise OutputError(f"{results} holds no results of `taisoft bench {benchmark}`")
-    return max(found, key=lambda numbers: numbers["date"])
 
 
 def measured_on(numbers: dict, *more: str) -> str:
@@ -254,10 +238,15 @@ def window_keys(_: dict) -> str:
 
 
 def gpu(numbers: dict) -> str:
-    """Sizes, works and sweeps on a GPU, as far as they were measured."""
-    found = {part["part"]: part["found"] for part in numbers["parts"]}
-    tables = [GPU_TABLES[name](found[name]) for name in ("sizes", "works", "sweeps", "reruns") if found.get(name)]
+    """What was measured on a GPU, without the results of tests and single kernels."""
+    shown = [part for part in numbers["parts"] if part["part"] not in ("tests", "profile") and part.get("rows")]
+    tables = [f"{part['title']}:\n\n{rows_table(part['rows'])}" for part in shown]
     return "\n\n".join(tables) + measured_on(numbers, numbers["gpu"])
+
+
+def counts(numbers: dict) -> str:
+    """Launches and accesses of steps on the GPU path."""
+    return rows_table(numbers["parts"][0]["rows"]) + measured_on(numbers)
 
 
 TABLES: dict[str, tuple[str, Callable[[dict], str]]] = {  # by marker: the benchmark with the numbers, or none, and the text
@@ -276,14 +265,16 @@ TABLES: dict[str, tuple[str, Callable[[dict], str]]] = {  # by marker: the bench
     "pictures": ("pictures", pictures),
     "window": ("window", window),
     "window_keys": ("", window_keys),
-    "gpu": ("cuda_check", gpu),
+    "gpu": ("gpu on cuda", gpu),
+    "counts": ("gpu on cpu", counts),
 }
 
 
 def made(name: str, results: Path = RESULTS) -> str:
     """The text at a marker. Raises OutputError."""
     benchmark, text = TABLES[name]
-    return text(newest(results, benchmark) if benchmark else {})
+    name, _, arch = benchmark.partition(" on ")
+    return text(newest(results, name, arch) if benchmark else {})
 
 
 def filled(text: str, results: Path = RESULTS) -> str:

@@ -61,12 +61,12 @@ def named_out(options: argparse.Namespace, name: str) -> Path | None:
 def parse_options(
     parser: argparse.ArgumentParser, argv: list[str] | None, drawn: str = "", arch: bool = True
 ) -> argparse.Namespace:
-    """Add --out [FILE.json], --arch unless it is always cpu, and --plot if something is drawn; parse.
+    """Add --out [FILE.json], --arch unless it is always cpu or there already, and --plot if something is drawn; parse.
 
     An option `results` may say what results without a name are named after, if not after the benchmark. Raises OutputError if a
     file cannot be written.
     """
-    parser.set_defaults(arch="cpu")
+    parser.set_defaults(arch=parser.get_default("arch") or "cpu")
     if arch:
         add_arch(parser)
     add_named_out(parser)

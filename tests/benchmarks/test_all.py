@@ -7,7 +7,7 @@ Where a benchmark has no small form, one is made here. Stand-ins take the place 
 * child processes, whose work is done in this process: crossings, error, hard, many, pictures, scaling, tolerance;
 * the simulators of error and tolerance, by one with known errors; the display of window.
 
-The long runs do without them. The others run in test_cuda_check.py, test_document.py (figures, manual), test_peers.py and
+The long runs do without them. The others run in test_document.py (figures, manual), test_peers.py and
 tests/references.
 """
 
@@ -29,6 +29,8 @@ from benchmarks import (
     contact_runs,
     elasticity,
     error,
+    gpu,
+    gpu_parts,
     gym,
     hard_runs,
     launches,
@@ -125,6 +127,21 @@ def error_check(n):
 
 def laws_small(patch, folder):
     replace(patch, laws, QUICK_SIZES={"step": (2, 1, 1), "assembly": (2, 1, 1)}, compile_seconds=lambda name: 1.0, STEPS=1)
+
+
+def gpu_small(patch, folder):
+    """Without results of a device."""
+    replace(patch, gpu, RESULTS=folder)
+    replace(patch, gpu_parts, PLATES=(2,), REPEATS=1)
+    answer_here(patch, gpu_parts.answer)
+
+
+def gpu_check(n):
+    launches, counts, sweeps = (part["rows"] for part in n["parts"])
+    assert min(row.get("launch [us]", 1.0) for row in launches) > 0 and launches[-1]["time [us]"] > 0
+    step, batch, implicit = counts
+    assert 0 < step["launches"] < batch["launches"] and implicit["N"] > 0 < implicit["contacts"] and implicit["E"] > 0
+    assert sweeps[0]["residual"] < 1e-4 and sweeps[0]["colours"] > 1
 
 
 def gym_small(patch, folder):
@@ -245,6 +262,12 @@ RUNS = {
     ),
     "elasticity": Small(QUICK, ("| SNH | 6.00 |", "| 1.00 | 1.10 | 0.50 |", "cores, load"), elasticity_small),
     "error": Small(BEAM, ("| hanging beam | bdf2 | 160 |", "a note"), error_small, error_check),
+    "gpu": Small(
+        ("--quick", "--arch", "cpu", "--only", "micro", "counts", "sweeps"),
+        ("Not run on a device", "| a barrier of a block |", "| a sub-step |", "| an implicit step |"),
+        gpu_small,
+        gpu_check,
+    ),
     "gym": Small(
         QUICK,
         ("| velocity_verlet |", "| W1 12x3x3 | taisoft |", "MuJoCo is left out: it is not asked for."),

@@ -24,8 +24,8 @@ from taisoft.cli.scene_file import shipped_files
 from taisoft.errors import OutputError
 
 WRITING = (  # benchmarks with --out FILE.json; those without have no file of that name to refuse
-    "collision contact crossings elasticity error hard ipc launches order peers pictures references scaling startup tolerance "
-    "window"
+    "collision contact crossings elasticity error gpu hard ipc launches order peers pictures references scaling startup "
+    "tolerance window"
 ).split()
 TEXT = "before\n<!-- begin fake -->\nold\n<!-- end fake -->\nafter\n"
 
@@ -69,7 +69,7 @@ def test_bad_options_are_refused_before_measuring(tmp_path, capsys):
                 wrong.append(f"{name} wrote {path}")
             except OutputError as error:
                 wrong += [] if message in str(error) else [f"{name}: {error}"]
-    for name in set(WRITING) | {"regression", "report", "cuda_check", "figures", "manual"}:
+    for name in set(WRITING) | {"regression", "report", "gpu", "figures", "manual"}:
         with pytest.raises(SystemExit):
             importlib.import_module(f"benchmarks.{name}").main(["--nothing"])
     with pytest.raises(OutputError, match=r"must end in \.png"):

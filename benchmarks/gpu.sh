@@ -1,11 +1,11 @@
 #!/usr/bin/env bash
 # Checks taisoft on a machine with one GPU, Python 3.12 and no network, in under eight minutes.
 #
-#   benchmarks/cuda_check.sh --fetch WHEELS     on a machine with a network: fetch the wheels (60 MB)
-#   benchmarks/cuda_check.sh WHEELS OUT         on the machine with the GPU: install them aside, write OUT/cuda-check.md and .json
+#   benchmarks/gpu.sh --fetch WHEELS     on a machine with a network: fetch the wheels (60 MB)
+#   benchmarks/gpu.sh WHEELS OUT         on the machine with the GPU: install them aside, write OUT/gpu.md and .json
 #
 # NumPy and SciPy are taken from the machine; add their wheels to WHEELS where it has none. Further arguments go to
-# `taisoft bench cuda_check`. PYTHON names the interpreter. A wheel that cannot be installed does not stop the rest.
+# `taisoft bench gpu`. PYTHON names the interpreter. A wheel that cannot be installed does not stop the rest.
 set -uo pipefail
 PYTHON=${PYTHON:-python3}
 
@@ -32,4 +32,4 @@ for wheel in "$wheels"/*.whl; do
     echo "could not be installed: $wheel" | tee -a "$out/not-installed.txt" >&2
 done
 export PYTHONPATH="$site:$PWD${PYTHONPATH:+:$PYTHONPATH}" XDG_CACHE_HOME="$site/cache"
-"$PYTHON" -m taisoft bench cuda_check --out "$out" "$@"
+"$PYTHON" -m taisoft bench gpu --arch cuda --out "$out/gpu.json" "$@"
