@@ -4,16 +4,21 @@ A kernel is compiled for a structure and a precision, and a process keeps those 
 order by precision, and processes take files from both ends of it: one of two processes hardly compiles what the other one does.
 Without --long, kernels are compiled without Taichi's advanced optimisation: that takes a quarter less, and the code, up to five
 times as slow, computes the same bits.
+
+A test marked `gpu_path` runs twice, the second time on the GPU path; of one marked `gpu_path("bdf2")` only variants with this in
+their names do. What it shares with other tests must take the fixture `taken_path`, so that there is one on each path.
 """
 
 import os
 from collections.abc import Iterator
+from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
 from taichi._lib import core
 
 from taisoft import compile_message
+from taisoft.backend.paths import gpu_path
 from tests.cli.command import BEAM, write
 
 SHARED = Path(__file__).resolve().parents[1].parent / "shared"
@@ -23,6 +28,8 @@ FOLDERS = (
     *("structure", "scene", "mesh", "backend"),
     *("output", "study", "many", "view", "faults", "cli", "benchmarks", "scenes"),
 )
+
+GPU_PATH = "gpu_path"  # marker, and name of the second run
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -34,8 +41,38 @@ def pytest_configure(config: pytest.Config) -> None:
         os.environ.setdefault("TI_ADVANCED_OPTIMIZATION", "0")  # read by ti.init, here and in child processes
 
 
+def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
+    """Run a test marked `gpu_path` twice."""
+    if metafunc.definition.get_closest_marker("gpu_path"):
+        metafunc.parametrize("taken_path", [None, GPU_PATH], ids=["cpu", GPU_PATH], indirect=True)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def taken_path(request: pytest.FixtureRequest) -> Iterator[None]:
+    """What is made while this is open takes the GPU path in one of the two runs of a test marked so; None in all others."""
+    with gpu_path() if getattr(request, "param", None) else nullcontext():
+        yield
+
+
+def _on_gpu_path(item: pytest.Item) -> bool:
+    """Whether it is the second run of a test. Raises UsageError if that takes something made for the first one."""
+    if getattr(item, "callspec", None) is None or item.callspec.params.get("taken_path") is None:
+        return False
+    fixtures, names = item._fixtureinfo.name2fixturedefs, list(item._fixtureinfo.argnames)
+    for name in names:
+        for fixture in fixtures.get(name, ())[-1:]:
+            names += [other for other in fixture.argnames if other not in names]
+            if fixture.scope != "function" and fixture.baseid.startswith("tests/") and "taken_path" not in fixture.argnames:
+                raise pytest.UsageError(f"{item.nodeid}: the fixture '{name}' must take `taken_path`")
+    return True
+
+
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Leave out the long ones unless all that is asked for is long, skip what needs a GPU, and sort."""
+    for item in [item for item in items if _on_gpu_path(item)]:
+        asked = item.get_closest_marker("gpu_path").args
+        if asked and not any(text in item.name for text in asked):
+            items.remove(item)
     long = [item for item in items if item.get_closest_marker("long")]
     named = len(long) == len(items) and any("::" in name for name in config.args)  # what is named one by one is meant
     if not (named or config.getoption("--long")):

@@ -69,6 +69,7 @@ THROUGH = {
 }
 
 
+@pytest.mark.gpu_path("film")
 @pytest.mark.filterwarnings("ignore:.*needles.*", "ignore:.*lies? through its thickness.*")
 @pytest.mark.parametrize("case", THROUGH)
 def test_what_goes_through_is_refused(case):

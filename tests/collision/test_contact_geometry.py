@@ -58,6 +58,7 @@ def test_contacts_by_proximity(shared):
     assert problems("proximity", CASES) == []
 
 
+@pytest.mark.gpu_path
 def test_contacts_by_distance_field():
     assert problems("distance_field", {name: case for name, case in CASES.items() if case.field}) == []
 

@@ -21,7 +21,7 @@ from tests.dynamics.scenes import dynamics, rows_of, set_state
 
 
 @pytest.fixture(scope="module")
-def made():
+def made(taken_path):
     scene, place = zoo()
     with simulator(scene) as sim:
         yield sim, place
@@ -36,6 +36,7 @@ def still(made):
     return sim, place, sim.positions()
 
 
+@pytest.mark.gpu_path
 def test_all_kinds_of_contacts_are_found(still):
     c = still[0].detect_contacts()
     touching = [("block", "ball"), ("block", "brick"), ("ball", "egg"), ("block", "ground"), ("block", "sphere")]

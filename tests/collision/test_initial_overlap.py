@@ -37,7 +37,7 @@ BODIES = {
 
 
 @pytest.fixture(scope="module")
-def sim():
+def sim(taken_path):
     """Separate bodies and one obstacle of each kind."""
     scene = ts.Scene(gravity=(0, 0, 0))
     for k, (name, mesh) in enumerate(BODIES.items()):
@@ -87,6 +87,7 @@ CASES = {  # bodies with their centers [m] and rotations, the collider that the 
 }
 
 
+@pytest.mark.gpu_path
 def test_depth_and_names(sim):
     for name, (bodies, other, depth) in CASES.items():
         place(sim, **bodies)

@@ -123,6 +123,7 @@ def upper(scene: ts.Scene) -> np.ndarray:
     return (np.arange(sum(body.n_nodes for body in scene.bodies)) >= scene.bodies[0].n_nodes)[:, None]
 
 
+@pytest.mark.gpu_path
 def test_gaps_are_means_over_what_is_near():
     scene, tilt = blocks(), np.array([0.0, 0.004, 0.0])
     far = FARTHEST * 0.1 * mean_surface_edge([(body.rest_positions, body.nodes.surface) for body in scene.bodies])
@@ -202,6 +203,7 @@ def test_thin_plates_meet_only_with_the_sides_that_face_each_other():
     assert (c.normal[:, 1] < -1 + 1e-12).all() and set(zip(c.body_a, c.body_b)) == {("plate 0", "plate 1")}
 
 
+@pytest.mark.gpu_path
 @pytest.mark.parametrize("order", [1, 2])
 def test_a_fold_has_contacts_within_a_body(order):
     """A sheet that is bent back over itself, to a gap of GAP between its halves."""

@@ -161,6 +161,7 @@ def test_where_nothing_crosses_nothing_is_behind():
         )
 
 
+@pytest.mark.gpu_path
 @pytest.mark.filterwarnings("ignore::UserWarning")
 def test_crossing_pairs_are_exempt_until_they_do_not_cross():
     """Two crossing boxes and a crossing sphere; a core inside a box; a box apart that moves into one of them; a ground; a sheet

@@ -43,7 +43,7 @@ def scene() -> ts.Scene:
 
 
 @pytest.fixture(scope="module")
-def begun():
+def begun(taken_path):
     """The dynamics with the contact problem of a step; the number of its contacts."""
     with dynamics(scene(), dt=DT, integrator="symplectic_euler", precision="f64") as made:
         yield made, made.contact.begin(made.state.time, DT)
@@ -53,6 +53,7 @@ def rows(field, n: int) -> np.ndarray:
     return field.to_numpy()[:n]
 
 
+@pytest.mark.gpu_path
 def test_frames_and_pairs(begun):
     """Also after friction and restitution of a pair change."""
     made, n = begun
@@ -147,6 +148,7 @@ def find_gaps_minus_targets(f: ti.template(), n: ti.types.ndarray(), out: ti.typ
         out[c] = gap_minus_target(f, c, n[0], n[1], n[2], n[3], n[4], opening, ti.cast(0.1, ti.f64))
 
 
+@pytest.mark.gpu_path
 @pytest.mark.parametrize("fast, slow", [(1.0, 0.02), (0.05, 0.005)])
 def test_gap_minus_target(fast, slow):
     h, dt, fastest, arena = 2e-3, 0.01, 2.0, FieldArena()

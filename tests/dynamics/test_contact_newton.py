@@ -37,7 +37,7 @@ def cubes(lower_young: float = 2e5) -> ts.Scene:
 
 
 @pytest.fixture(scope="module")
-def shared_dynamics():
+def shared_dynamics(taken_path):
     with dynamics(cubes(), **SETTINGS) as made:
         yield made
 
@@ -122,6 +122,7 @@ def test_impulses_below_the_rounding_of_momenta_need_not_obey_the_laws(made, mon
     assert system.impulses_are_rounding()
 
 
+@pytest.mark.gpu_path
 def test_flush_blocks_come_to_rest():
     """Their redundant contacts exchange impulses, so that iterations stall in one step of four: those are solved directly."""
     scene = ts.Scene()
@@ -146,6 +147,7 @@ def test_a_direct_solve_goes_on_where_iterations_ended(made, monkeypatch):
     assert any(one is not None for one in found) and np.abs(x - expected).max() < 1e-8
 
 
+@pytest.mark.gpu_path("gpu_path-implicit_euler")
 @pytest.mark.parametrize("scheme", ["implicit_euler", "linearly_implicit_euler"])
 def test_contact_laws_hold_with_an_indefinite_matrix(made, monkeypatch, scheme):
     """The upper cube is squeezed flat as it lands. Where the matrix is indefinite, a projected one is used."""

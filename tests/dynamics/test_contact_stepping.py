@@ -58,7 +58,7 @@ def scene() -> ts.Scene:
 
 
 @pytest.fixture(scope="module", params=DT)
-def shared_sim(request):
+def shared_sim(request, taken_path):
     tight = {"newton_tolerance": 1e-10} if request.param in IMPLICIT else {}
     with ts.Simulator(scene(), DT[request.param], request.param, precision="f64", contact_tolerance=1e-8, **tight) as sim:
         yield sim
@@ -148,6 +148,7 @@ def test_contact_forces_balance_weight(sim):
     assert np.abs(sim.velocities("cube")).max() < 0.05
 
 
+@pytest.mark.gpu_path
 @by("symplectic_euler")
 def test_an_explicit_step_rebounds_with_the_speed_of_its_middle(sim):
     """A cube at its contact offset that falls at u, and faster by k after the step: restitution of u + k/2, then k/2."""
@@ -175,6 +176,7 @@ def test_turntable_carries_the_cube(sim):
     assert np.arctan2(-x[2], x[0]) == pytest.approx(2.0 * 0.4 - 0.04, abs=0.03)
 
 
+@pytest.mark.gpu_path("symplectic_euler")
 def test_momentum(sim):
     """Of the two flying bodies, which meet: the impulse law of each, and what both conserve."""
     own, names = slice(rows_of(sim, "left").start, rows_of(sim, "right").stop), ("left", "right")

@@ -176,6 +176,7 @@ def test_a_bowl_keeps_energy():
     assert 44.0 < -min(angles) < 45.5, min(angles)
 
 
+@pytest.mark.gpu_path
 def test_what_rests_is_not_searched_again(monkeypatch):
     looks, find = [], Detection.find_at_end
     monkeypatch.setattr(Detection, "find_at_end", lambda self, *arguments: looks.append(1) or find(self, *arguments))

@@ -52,7 +52,7 @@ def simulator(integrator: str) -> ts.Simulator:
 
 
 @pytest.fixture(scope="module")
-def shared_sim():
+def shared_sim(taken_path):
     with simulator("implicit_euler") as sim:
         yield sim
 
@@ -127,6 +127,7 @@ def test_spins_throws_and_vibrations_create_no_energy(sim):
         assert run(sim, 0.2)[0] < 1e-3 * (start.kinetic + start.elastic)
 
 
+@pytest.mark.gpu_path
 def test_two_colliding_cubes_separate_by_their_restitution(sim):
     sim.set_gravity((0, 0, 0))
     sim.set_contact("cube", "other", friction=0.3, restitution=0.5)
@@ -142,6 +143,7 @@ def test_two_colliding_cubes_separate_by_their_restitution(sim):
     assert (b - a)[0] == pytest.approx(1.5 * 0.5, rel=0.1)  # off centre: some energy goes into rotation
 
 
+@pytest.mark.gpu_path
 def test_a_moving_plane_imparts_twice_its_speed(sim):
     sim.set_gravity((0, 0, 0))
     sim.set_contact("cube", "ground", restitution=1.0)

@@ -46,7 +46,7 @@ def pressed() -> ts.Scene:
 
 
 @pytest.fixture(scope="module", params=["implicit_euler", "bdf2", "implicit_midpoint", "contacts"])
-def shared_sim(request):
+def shared_sim(request, taken_path):
     contacts = request.param == "contacts"
     integrator = "implicit_euler" if contacts else request.param
     with ts.Simulator(pressed() if contacts else bar(), DT, integrator, **TIGHT) as sim:
@@ -121,6 +121,7 @@ def patch_ways(patch, ways: list[int]) -> list:
     return calls
 
 
+@pytest.mark.gpu_path("contacts")
 @by("contacts")
 def test_a_step_whose_way_is_blocked_is_halved(sim, monkeypatch):
     calls = []
@@ -171,6 +172,7 @@ def test_where_surfaces_cross_unknown_contacts_are_met(sim, monkeypatch):
     assert np.array_equal(sim.positions(), x)
 
 
+@pytest.mark.gpu_path("contacts")
 @by("contacts")
 def test_what_a_way_meets_becomes_a_contact_of_the_same_part(sim, monkeypatch):
     """Each time the stage is solved on from the velocities reached, at most MAX_PASSAGES times; then it is halved."""

@@ -66,6 +66,7 @@ def on_ground(push: float, order: int = 1, turn: np.ndarray | None = None, mesh:
     return scene
 
 
+@pytest.mark.gpu_path("f64")
 @pytest.mark.parametrize("precision", ["f32", "f64"])
 @pytest.mark.parametrize(("integrator", "dt", "seconds"), [("implicit_euler", 0.02, 0.6), ("symplectic_euler", 4e-4, 0.4)])
 def test_a_block_sticks_below_the_threshold_and_slips_above(precision, integrator, dt, seconds):

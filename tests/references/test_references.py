@@ -32,6 +32,7 @@ COARSE = [
 ]
 
 
+@pytest.mark.gpu_path("rigid_slope-slides")
 @pytest.mark.parametrize("case", COARSE)
 def test_reference(case, shared):
     path = shared / "references" / f"{case.problem}.json"

@@ -44,6 +44,7 @@ def test_continuing_without_contacts(tmp_path):
         assert_same(follow(loaded, 5), expected[30:])
 
 
+@pytest.mark.gpu_path
 def test_continuing_with_contacts(tmp_path):
     """A cube is pressed on a moving floor. At rest the two overlap, which must not matter later."""
     path = tmp_path / "checkpoint.npz"

@@ -118,6 +118,7 @@ def test_stack_carries_its_weight():
         assert result.contact_force(above, below)[1] == pytest.approx(n * WEIGHT, rel=1e-5)
 
 
+@pytest.mark.gpu_path
 def test_friction_holds_up_to_its_limit():
     held = ts.solve_static(block_on_ground(force=(0.9 * 0.5 * WEIGHT, 0.0, 0.0)), tolerance=1e-7)
     assert held.converged and held.contact_force("block")[0] == pytest.approx(-0.45 * WEIGHT, rel=1e-5)
