@@ -41,7 +41,7 @@ def scene() -> ts.Scene:
 
 
 @pytest.fixture(scope="module")
-def shared_sim(taken_path):
+def shared_sim():
     with ts.Simulator(scene(), dt=1 / 60, integrator="implicit_euler", precision="f64") as sim:
         yield sim
 
@@ -131,7 +131,6 @@ def test_a_projectile_may_be_too_fast_only_where_paths_are_not_checked(sim, monk
     assert sim.step_count == 0 and sim.time == 0.0
 
 
-@pytest.mark.gpu_path
 def test_a_plane_stops_bodies_of_any_speed(sim):
     speed = 60.0  # [m/s], 1 m a step; the cube is 0.05 m long
     shoot(sim, speed, "faller")

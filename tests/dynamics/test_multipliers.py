@@ -311,7 +311,6 @@ def test_tensions_have_a_sign_and_damping():
             sim.joint_force("ss")
 
 
-@pytest.mark.gpu_path
 @pytest.mark.parametrize("stiffness", [None, 1e6])
 def test_a_pulley_lifts_a_load(stiffness):
     lift = ts.KeyFrames((0.0, 0.2), translations=[(0, 0, 0), (0, 0.1, 0)], smooth=True)

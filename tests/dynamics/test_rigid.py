@@ -263,7 +263,6 @@ def test_a_body_rises_to_the_square_of_the_restitution(integrator, restitution):
         assert max(speeds[lowest:]) < 0.01 * speed
 
 
-@pytest.mark.gpu_path
 def test_explicit_impacts_keep_momentum_and_angular_momentum():
     """Also between rigid and soft bodies."""
     scene = ts.Scene(gravity=(0, 0, 0))
