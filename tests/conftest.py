@@ -30,6 +30,8 @@ FOLDERS = (
 )
 
 GPU_PATH = "gpu_path"  # marker, and name of the second run
+TAKEN = "taken_path"
+path: dict[str, str | None] = {TAKEN: None}  # on which that and other fixtures of a module were made
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -43,35 +45,41 @@ def pytest_configure(config: pytest.Config) -> None:
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
     """Run a test marked `gpu_path` twice."""
-    if metafunc.definition.get_closest_marker("gpu_path"):
-        metafunc.parametrize("taken_path", [None, GPU_PATH], ids=["cpu", GPU_PATH], indirect=True)
+    if metafunc.definition.get_closest_marker(GPU_PATH):
+        metafunc.parametrize(TAKEN, [None, GPU_PATH], ids=["cpu", GPU_PATH], indirect=True)
 
 
 @pytest.fixture(scope="module", autouse=True)
 def taken_path(request: pytest.FixtureRequest) -> Iterator[None]:
-    """What is made while this is open takes the GPU path in one of the two runs of a test marked so; None in all others."""
-    with gpu_path() if getattr(request, "param", None) else nullcontext():
+    """What is made while this is open takes the GPU path in the second run of a test marked so."""
+    path[TAKEN] = getattr(request, "param", None)
+    with gpu_path() if path[TAKEN] else nullcontext():
         yield
 
 
-def _on_gpu_path(item: pytest.Item) -> bool:
-    """Whether it is the second run of a test. Raises UsageError if that takes something made for the first one."""
-    if getattr(item, "callspec", None) is None or item.callspec.params.get("taken_path") is None:
-        return False
-    fixtures, names = item._fixtureinfo.name2fixturedefs, list(item._fixtureinfo.argnames)
-    for name in names:
-        for fixture in fixtures.get(name, ())[-1:]:
-            names += [other for other in fixture.argnames if other not in names]
-            if fixture.scope != "function" and fixture.baseid.startswith("tests/") and "taken_path" not in fixture.argnames:
-                raise pytest.UsageError(f"{item.nodeid}: the fixture '{name}' must take `taken_path`")
-    return True
+def pytest_fixture_setup(fixturedef: pytest.FixtureDef, request: pytest.FixtureRequest) -> None:
+    """Remember on which path it is made what the tests of a module share."""
+    if fixturedef.scope == "module" and fixturedef.argname != TAKEN:
+        path[fixturedef.argname] = path[TAKEN]
+
+
+def pytest_fixture_post_finalizer(fixturedef: pytest.FixtureDef, request: pytest.FixtureRequest) -> None:
+    """Forget that."""
+    if fixturedef.argname != TAKEN:
+        path.pop(fixturedef.argname, None)
+
+
+def pytest_runtest_call(item: pytest.Item) -> None:
+    """Refuse what was made on the other path."""
+    others = [name for name in item.fixturenames if path.get(name, path[TAKEN]) != path[TAKEN]]
+    assert others == [], f"the fixtures {others} must take `taken_path`"
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Leave out the long ones unless all that is asked for is long, skip what needs a GPU, and sort."""
-    for item in [item for item in items if _on_gpu_path(item)]:
-        asked = item.get_closest_marker("gpu_path").args
-        if asked and not any(text in item.name for text in asked):
+    for item in list(items):
+        asked = marker.args if (marker := item.get_closest_marker(GPU_PATH)) else ()
+        if asked and item.callspec.params[TAKEN] and not any(text in item.name for text in asked):
             items.remove(item)
     long = [item for item in items if item.get_closest_marker("long")]
     named = len(long) == len(items) and any("::" in name for name in config.args)  # what is named one by one is meant

@@ -147,7 +147,6 @@ def test_a_direct_solve_goes_on_where_iterations_ended(made, monkeypatch):
     assert any(one is not None for one in found) and np.abs(x - expected).max() < 1e-8
 
 
-@pytest.mark.gpu_path("gpu_path-implicit_euler")
 @pytest.mark.parametrize("scheme", ["implicit_euler", "linearly_implicit_euler"])
 def test_contact_laws_hold_with_an_indefinite_matrix(made, monkeypatch, scheme):
     """The upper cube is squeezed flat as it lands. Where the matrix is indefinite, a projected one is used."""
