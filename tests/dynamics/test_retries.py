@@ -172,7 +172,6 @@ def test_where_surfaces_cross_unknown_contacts_are_met(sim, monkeypatch):
     assert np.array_equal(sim.positions(), x)
 
 
-@pytest.mark.gpu_path("contacts")
 @by("contacts")
 def test_what_a_way_meets_becomes_a_contact_of_the_same_part(sim, monkeypatch):
     """Each time the stage is solved on from the velocities reached, at most MAX_PASSAGES times; then it is halved."""
