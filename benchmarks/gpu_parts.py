@@ -49,7 +49,7 @@ SHARED = 24  # cells of the cubes on the CPU, whose threads then share linear so
 PLATES, QUICK_PLATES = (8, 32, 64, 128), (4,)
 BEAMS = {17: "13", 37: "42 to 68"}  # cells across a beam of 20 n^3 tets, and estimate of a CG iteration [us]
 BATCH, WARM, RERUNS, DEAREST = 16, 10, 3, 30
-REPEATS, PHASES, SPINS, THREADS = 200, 1000, 10**5, 10**6
+REPEATS, PHASES, SPINS, THREADS = 200, 1000, 1000, 10**6
 SOLVES, UPDATES, SEARCHES, LEGS = "find_step_length", "update_multipliers", "update_surface", "check_paths"  # by their kernels
 
 

@@ -14,9 +14,9 @@ import taichi as ti
 import taisoft as ts
 from taisoft.backend.arrays import FieldArena
 from taisoft.backend.runtime import kernel
-from taisoft.contact.targets import gap_minus_target
 from taisoft.contact.problem import build_node_problem, fill_field, read_entries
 from taisoft.contact.restitution import explicit_opening, find_rebounds
+from taisoft.contact.targets import gap_minus_target
 from tests.collision.rotations import rotation
 from tests.contact import contact_oracle as oracle
 from tests.dynamics.scenes import dynamics, set_state

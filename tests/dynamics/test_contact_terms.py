@@ -15,8 +15,8 @@ import pytest
 import taichi as ti
 
 import taisoft as ts
-from taisoft.contact.targets import set_targets
 from taisoft.contact.problem import RESIDUAL, build_node_problem, fill_field, fill_rows, find_factors, index_nodes
+from taisoft.contact.targets import set_targets
 from taisoft.dynamics import contact_terms, linearised
 from taisoft.dynamics.contact_terms import NO_CONTACTS
 from taisoft.dynamics.dirichlet import DirichletConditions
