@@ -26,7 +26,8 @@ from taisoft.collision.contacts import FACE_FACE, write_contact
 from taisoft.collision.features import unit
 from taisoft.collision.near_list import OUTDATED, STILL, UNCOVERED, clear_ends, hint_of, list_unseparated, prepare_paths
 from taisoft.collision.separation import at_weights, free_until, nearest_of, separating_plane, unit_row
-from taisoft.collision.surface import EVENT, GO, dvec, ivec
+from taisoft.collision.surface import dvec, ivec
+from taisoft.fem.state import EVENT, GO
 
 # kinds of passages, by two ids: two triangles; a row of `adjacent`; a triangle and a sphere or capsule; a vertex and a half-space
 NEAR, ADJACENT, ROUND, FLAT = range(4)

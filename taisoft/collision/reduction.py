@@ -53,6 +53,11 @@ class ReductionFields:
     kept: Any  # (capacity) i32
     count: Any  # (4) i32
 
+    @ti.func
+    def n_kept(self):
+        """Number of kept contacts."""
+        return self.count[LEFT]
+
 
 def reduction_fields(arena: FieldArena, capacity: int, serial: bool, spread: int = 1) -> ReductionFields:
     """Allocate the workspace for `capacity` contacts."""

@@ -6,7 +6,8 @@ from taisoft.backend.runtime import kernel
 from taisoft.collision.analytic import write_analytic
 from taisoft.collision.candidates import NEEDED
 from taisoft.collision.reduction import LEFT, reduce_all
-from taisoft.collision.surface import EVENT, GO, NONFINITE, move_surface
+from taisoft.collision.surface import NONFINITE, move_surface
+from taisoft.fem.state import EVENT, GO
 
 
 @kernel(cse=False)

@@ -18,6 +18,7 @@ from taisoft.backend.lists import part_first, spread_on, sum_before
 from taisoft.backend.paths import gpu_threads
 from taisoft.backend.runtime import Runtime, kernel
 from taisoft.collision.colliders import Topology
+from taisoft.fem.state import GO
 
 SERIAL_BELOW = 1500  # triangles below which one thread is faster than starting the others (about 50 us a loop)
 # Of one thread per triangle: in the loops over nearby pairs, and in cheap loops (boxes, tree refit, sharp edges, reduction)
@@ -25,7 +26,6 @@ TRIANGLE_SECONDS, CHEAP_SECONDS = 1e-7, 5e-9
 NOT_FINITE = 0x7FF  # exponent bits of infinite f64 numbers and of those that are no numbers
 CPU_CHUNKS, GPU_CHUNKS = 64, 4096  # chunks of a list that are processed in parallel, each with its own part of a buffer
 NONFINITE, ACTIVE, PAIRS = 0, 1, 2  # indices into Surface.count
-GO, EVENT = 0, 1  # indices into Surface.run
 INSIDE_BITS = 31  # of Surface.inside; one vertex is almost never inside two colliders with the same bit
 
 dvec = ti.types.vector(3, ti.f64)

@@ -13,13 +13,12 @@ from taisoft.backend.arrays import FieldArena
 from taisoft.backend.lists import add_up_counts, clear_counts, count_entries, keys_if
 from taisoft.backend.runtime import kernel
 from taisoft.backend.team import keep_marked
-from taisoft.collision.reduction import LEFT
-from taisoft.collision.surface import GO
 from taisoft.contact.past import keep_impulses, load_of, warm_impulse
 from taisoft.contact.problem import NODES, fill_field, list_entries, to_frame
 from taisoft.contact.prox import OPEN, SLIP, dvec, prox, scaled, state_of, tangent
 from taisoft.contact.targets import STILL, contact_offset_of
 from taisoft.fem.model import Model
+from taisoft.fem.state import GO
 from taisoft.scene.scene import Scene
 
 NEGLIGIBLE = 1e-12  # a node with a smaller weight is left out of the contact
@@ -265,7 +264,7 @@ def fill(
     ti.loop_config(serialize=True)
     for _ in range(1):
         if s.run[GO] == 1:
-            p.count[0] = ti.select(n_kept < 0, reduction.count[LEFT], n_kept)
+            p.count[0] = ti.select(n_kept < 0, reduction.n_kept(), n_kept)
     clear_counts(p.room, keys_if(s.run[GO], p.count[0]))
     ti.loop_config(serialize=p.serial)
     for c in range(s.run[GO] * p.count[0]):

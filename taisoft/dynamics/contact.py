@@ -173,6 +173,7 @@ class ContactStep:
         now.held, self._asleep = NO_PASSAGES, None
         self.misplaced.start_step()
         self.paths.forget()
+        self._is_fast = False
 
     def discard_search(self, with_impulses: bool) -> None:
         """Discard the search of a substep that was undone; the impulses that are left warm-start the next attempt."""

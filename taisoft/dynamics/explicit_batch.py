@@ -13,7 +13,6 @@ import taichi as ti
 from taisoft.backend.arrays import FieldArena
 from taisoft.backend.runtime import kernel
 from taisoft.collision.reduction import FOUND, LEFT
-from taisoft.collision.surface import EVENT, GO
 from taisoft.contact.build import NODES, fill, finish_contacts
 from taisoft.contact.problem import RESIDUAL, SWEEPS
 from taisoft.contact.solve import MOST_OF_TEAM, sweeps_per_launch, team_of
@@ -22,6 +21,7 @@ from taisoft.dynamics.explicit_contact import begin_solve, finish_verlet, move, 
 from taisoft.dynamics.explicit_stepper import SubstepWork
 from taisoft.dynamics.simulation_state import SimulationState
 from taisoft.dynamics.state import StepState
+from taisoft.fem.state import EVENT, GO
 
 MOST = 32  # sub-steps of a batch
 NOTHING, NOT_SOLVED, FAULT, NOT_FREE, NOT_FOUND = range(5)  # events, in the order in which a sub-step may meet them
@@ -118,7 +118,7 @@ class Batch:
         begin_tally(detection.surface, self._tally, detection.counts.found, detection.counts.contacts)
         try:
             for k in range(n):
-                self._launch(k, time + k * dt, dt, good, max_sweeps)
+                self.launch(k, time + k * dt, dt, good, max_sweeps)
         finally:  # Ctrl-C, too
             self.tally, self.event = self._tally.to_numpy(), int(detection.surface.run[EVENT])
             if self.event != NOTHING:
@@ -126,7 +126,7 @@ class Batch:
             counts = (int(self.tally[k]) for k in (FOUND_BEFORE, FOUND_LAST, KEPT_LAST))
             contact.end_batch(time + self.tally[DONE] * dt, dt, *counts, self.event == NOTHING)
 
-    def _launch(self, k: int, time: float, dt: float, good: StepState, max_sweeps: int) -> None:
+    def launch(self, k: int, time: float, dt: float, good: StepState, max_sweeps: int) -> None:
         """Launch sub-step k of the batch."""
         model, contact, work, detection = self._simulation.model, self._contact, self._work, self._contact.detection
         p, s, search = contact.problem, detection.surface, (detection.surface, detection.shapes)

@@ -10,7 +10,6 @@ fail, 0 outside of batches. s: Surface; work: SubstepWork; p: ContactProblem.
 import taichi as ti
 
 from taisoft.backend.runtime import kernel
-from taisoft.collision.surface import EVENT, GO
 from taisoft.contact.build import relative_velocity
 from taisoft.contact.colouring import colour
 from taisoft.contact.problem import RESIDUAL, SWEEPS, impulse_on, set_factors, to_frame
@@ -33,7 +32,7 @@ from taisoft.dynamics.explicit import (
 )
 from taisoft.dynamics.rigid_motion import project_all, turn_all
 from taisoft.fem.dependents import place_all
-from taisoft.fem.state import FAILED, INVERTED_NOW, MOST_INVERTED
+from taisoft.fem.state import EVENT, FAILED, GO, INVERTED_NOW, MOST_INVERTED
 from taisoft.fem.terms import elasticity
 
 

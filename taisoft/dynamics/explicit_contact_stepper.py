@@ -49,7 +49,7 @@ class ContactExplicitStepper(ExplicitStepper):
         self.max_batch = min(self.max_batch, MAX_CONTACT_BATCH)
         self.contact_tolerance = settings.contact_tolerance or TOLERANCE[settings.precision]
         self._rigid = RigidContacts(simulation.model) if simulation.model.has_rigid_tets else None
-        self._batch = Batch(simulation, contact, self.work, self.method, self.contact_tolerance)
+        self.batch = Batch(simulation, contact, self.work, self.method, self.contact_tolerance)
 
     def forget(self) -> None:
         """Discard the search and impulses, after the state was set."""
@@ -86,7 +86,7 @@ class ContactExplicitStepper(ExplicitStepper):
                 if targets is not None:
                     self._upload_targets(targets[done : done + 1])
                 event, is_far = NOTHING, self.contact.is_far(start + done * dt, dt)
-                if not is_far and self._batch.suits():
+                if not is_far and self.batch.suits():
                     event = self._take_batch(min(n - done, MOST), start + done * dt, dt, tally)
                     done = int(tally[DONE])
                     if event == NOTHING:
@@ -129,7 +129,7 @@ class ContactExplicitStepper(ExplicitStepper):
 
     def _take_batch(self, n: int, time: float, dt: float, tally: np.ndarray) -> int:
         """Take a batch of up to n sub-steps from a time, and add it to the tally. Return the event that ended it early."""
-        batch = self._batch
+        batch = self.batch
         self._prepare(time)
         self.contact.search(time, dt)
         try:
@@ -231,11 +231,11 @@ class ContactExplicitStepper(ExplicitStepper):
     @property
     def field_bytes(self) -> dict[str, int]:
         """Bytes by name of the contact problem of rigid bodies."""
-        return super().field_bytes | self._batch.field_bytes | (self._rigid.field_bytes if self._rigid else {})
+        return super().field_bytes | self.batch.field_bytes | (self._rigid.field_bytes if self._rigid else {})
 
     def release(self) -> None:
         """Free its memory."""
         super().release()
-        self._batch.release()
+        self.batch.release()
         if self._rigid:
             self._rigid.release()

@@ -18,6 +18,7 @@ NORMS, N_NORMS = 15, 5  # of a residual, see `form_residual`; in `State.partial`
 IMPACT_SLOPE, IMPACT_CURVATURE, DEVIATION = range(20, 23)
 N_SCALARS = 23
 
+GO, EVENT = 0, 1  # indices into the state of a batch of sub-steps, see `Surface.run`
 SUM, OTHER_SUM, N_COLUMNS = 5, 6, 8  # further columns; `measure` uses the columns of its scalars
 
 

@@ -14,7 +14,9 @@ import taisoft as ts
 from taisoft.backend.counters import FILLS, counting, device_only
 from taisoft.backend.paths import AS_WRITTEN, Order, gpu_path
 from taisoft.dynamics import explicit_batch
+from taisoft.dynamics.dynamics import Dynamics
 from taisoft.dynamics.explicit_batch import DONE, FAULT, MOST, NOT_FOUND, NOT_FREE, NOT_SOLVED, NOTHING, Batch
+from tests.dynamics.scenes import dynamics
 
 DT, N = 2e-4, 16
 INTEGRATORS = "symplectic_euler", "velocity_verlet"
@@ -33,12 +35,12 @@ def scene(cells=(2, 2, 2), gravity: float = -9.81, velocity=(0.3, -0.3, 0), **se
     return made
 
 
-def take(sim: ts.Simulator, n: int) -> list:
+def take(sim: Dynamics, n: int) -> list:
     """Take n sub-steps. Return what is reported, with the message of an error that ends them."""
     reports = []
     try:
         while n > 0:
-            report = sim._dynamics.advance(n)
+            report = sim.advance(n)
             n -= report.steps
             numbers = report.contact_iterations, report.contact_residual, report.max_penetration, report.min_volume_ratio
             reports.append((*numbers, report.converged, report.n_contacts, report.problems))
@@ -47,17 +49,17 @@ def take(sim: ts.Simulator, n: int) -> list:
     return reports
 
 
-def state(sim: ts.Simulator) -> list[bytes]:
-    contacts = sim.contacts()
-    arrays = *sim._dynamics.state.state(), contacts.impulse, contacts.gap, contacts.slip, contacts.state.astype(str)
-    return [array.tobytes() for array in arrays] + [contacts.found, sim.step_count]
+def state(sim: Dynamics) -> list[bytes]:
+    contacts = sim.contact.contacts()
+    arrays = *sim.state.state(), contacts.impulse, contacts.gap, contacts.slip, contacts.state.astype(str)
+    return [array.tobytes() for array in arrays] + [contacts.found, sim.state.step_count]
 
 
 def run(made: ts.Scene, n: int, integrator: str = "velocity_verlet", floor: float | None = None) -> tuple:
     """What is reported of n sub-steps, and the state and contacts after them. floor [m]: to be kept by paths."""
-    with ts.Simulator(made, dt=DT, integrator=integrator, precision="f64") as sim:
+    with dynamics(made, dt=DT, integrator=integrator, precision="f64") as sim:
         if floor is not None:
-            sim._dynamics.contact.detection.paths.floor = floor
+            sim.contact.detection.paths.floor = floor
         return take(sim, n), state(sim)
 
 
@@ -88,25 +90,25 @@ def events(monkeypatch) -> set[tuple[bool, int]]:
 
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 def test_counts_of_a_batch(integrator, monkeypatch):
-    plain, batches, states = Batch._launch, 0, set()
+    plain, batches, states = Batch.launch, 0, set()
 
     def alone(*arguments):
         with device_only():
             plain(*arguments)
 
-    monkeypatch.setattr(Batch, "_launch", alone)
-    with gpu_path(), ts.Simulator(scene(), dt=DT, integrator=integrator, precision="f64") as sim:
+    monkeypatch.setattr(Batch, "launch", alone)
+    with gpu_path(), dynamics(scene(), dt=DT, integrator=integrator, precision="f64") as sim:
         take(sim, 5 * N)  # compiles
-        batch, good = sim._dynamics.stepper._batch, sim._dynamics.stepper.good
+        batch, good = sim.stepper.batch, sim.stepper.good
         for _ in range(8):
-            n_before = sim._dynamics.contact.n_contacts
+            n_before = sim.contact.n_contacts
             with counting() as counts:
-                batch.run(N, sim.time, DT, good, 1000)
+                batch.run(N, sim.state.time, DT, good, 1000)
             accesses = counts.accesses.total() - counts.accesses[FILLS] + counts.returned.total() + counts.host_arrays.total()
             assert batch.event == NOTHING and batch.tally[DONE] == N
             assert counts.launches.total() <= 8 * N + 1 and accesses <= 3
-            batches += sim._dynamics.contact.n_contacts > n_before
-            states |= set(sim.contacts().state)
+            batches += sim.contact.n_contacts > n_before
+            states |= set(sim.contact.contacts().state)
     assert batches and states == {"open", "stick", "slip"}
 
 
@@ -140,6 +142,7 @@ def test_events_end_as_single_substeps(event, integrator, on_gpu_path, singly, e
     elif not on_gpu_path:  # where the buffer has many parts, it is large
         made = lambda: scene(cells=(8, 1, 8), initial_capacity=64)  # noqa: E731
     else:
+        n = 2 * MOST
         monkeypatch.setattr(explicit_batch, "NODES", 10**9)
     with gpu_path() if on_gpu_path else pytest.MonkeyPatch.context():
         found = run(made(), n, integrator, floor)
@@ -151,7 +154,7 @@ def test_events_end_as_single_substeps(event, integrator, on_gpu_path, singly, e
 
 
 def test_an_interrupt_leaves_the_last_accepted_substep(monkeypatch):
-    plain, count = Batch._launch, []
+    plain, count = Batch.launch, []
 
     def interrupted(*arguments):
         count.append(1)
@@ -159,14 +162,14 @@ def test_an_interrupt_leaves_the_last_accepted_substep(monkeypatch):
             raise KeyboardInterrupt
         plain(*arguments)
 
-    monkeypatch.setattr(Batch, "_launch", interrupted)
-    with ts.Simulator(scene(), dt=DT, integrator="velocity_verlet", precision="f64") as sim:
-        while sim.step_count < 10:
+    monkeypatch.setattr(Batch, "launch", interrupted)
+    with dynamics(scene(), dt=DT, integrator="velocity_verlet", precision="f64") as sim:
+        while sim.state.step_count < 10:
             take(sim, 10)
         with pytest.raises(KeyboardInterrupt):
-            sim._dynamics.advance(3 * MOST)
-        at, positions = sim.step_count, sim._dynamics.state.state()[0]
+            sim.advance(3 * MOST)
+        at, positions = sim.state.step_count, sim.state.state()[0]
     assert len(count) - 1 == at
-    with ts.Simulator(scene(), dt=DT, integrator="velocity_verlet", precision="f64") as sim:
+    with dynamics(scene(), dt=DT, integrator="velocity_verlet", precision="f64") as sim:
         take(sim, at)
-        assert (sim._dynamics.state.state()[0] == positions).all()
+        assert (sim.state.state()[0] == positions).all()
