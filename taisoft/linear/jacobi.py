@@ -31,12 +31,16 @@ class Jacobi:
             if task % model.spread == 0 and work.state[STATUS] == RUNNING:
                 c, n, s = task // model.spread, model.n_nodes, ti.cast(0.0, ti.f64)
                 for at in range(chunk_size(model, c, n)):
-                    i = chunk_entry(model, c, at, n)
-                    r = work.r[i]
-                    z = block_times(work.inverse[i], r)
-                    work.z[i] = z
-                    s += dot64(r, z)
+                    s += self.apply_at(work, chunk_entry(model, c, at, n))
                 model.state.partial[c, OTHER_SUM] = s
+
+    @ti.func
+    def apply_at(self, work: ti.template(), i):
+        """Set z of node i; return its r.z."""
+        r = work.r[i]
+        z = block_times(work.inverse[i], r)
+        work.z[i] = z
+        return dot64(r, z)
 
 
 JACOBI = Jacobi()

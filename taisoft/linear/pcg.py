@@ -3,6 +3,9 @@
 A is a `BlockCsr` that holds the whole system, plus coupling terms J^T D J, plus a border G^T s G of few dense rows.
 Used with `Jacobi` on CUDA and for bordered systems, with `Factor` for slender bodies, and with `Volumes` for nearly
 incompressible ones. See `pcg_work` for where a solve stops.
+
+With block Jacobi, a team solves small systems in one launch (`run_team`), where one launch for each iteration would take longer
+than its work.
 """
 
 from dataclasses import dataclass
@@ -16,9 +19,15 @@ from taisoft.fem.model import Model
 from taisoft.fem.state import OTHER_SUM, SUM
 from taisoft.linear.block_csr import BlockCsr, block_times, off_diagonal_times
 from taisoft.linear.coupling import NO_COUPLING, Coupling, form_product, gather_products
+from taisoft.linear.jacobi import JACOBI
 from taisoft.linear.pcg_work import (
+    COUNT,
+    FAILED,
+    NEGATIVE,
     NEGATIVE_PENDING,
     RUNNING,
+    RZ,
+    RZ_START,
     STATUS,
     STEP,
     LinearResult,
@@ -27,9 +36,11 @@ from taisoft.linear.pcg_work import (
     dot64,
     end_iteration,
     set_step,
+    status_at,
+    step_along,
 )
 
-BATCH = 8  # iterations between two readings of the status on CUDA
+BATCH, TEAM_BATCH = 8, 256  # iterations between two readings of the status on CUDA, of launches and of a team
 
 
 class Preconditioner(Protocol):
@@ -74,6 +85,11 @@ def solve(
 ) -> LinearResult:
     """Solve for work.y given work.rhs. tolerance: of sqrt(r.z); terms, same_matrix: see `gauss_seidel.solve`."""
 
+    if work.team is not None and preconditioner is JACOBI and not border.any:
+        run_team(model, A, preconditioner, terms, work, tolerance, int(same_matrix), 1, max_iterations)
+        while (result := work.result(max_iterations)) is None:
+            run_team(model, A, preconditioner, terms, work, tolerance, int(same_matrix), 0, max_iterations)
+        return result
     left = max_iterations
     start(model, A, preconditioner, terms, work, tolerance, int(same_matrix))
     while (result := work.result(max_iterations)) is None:
@@ -103,10 +119,7 @@ def start(
         if task % model.spread == 0:
             c, n = task // model.spread, model.n_nodes
             for at in range(chunk_size(model, c, n)):
-                i = chunk_entry(model, c, at, n)
-                preconditioner.prepare(model, A, terms, work, i, same_matrix)
-                work.r[i] = model.free[i] * work.rhs[i]
-                work.y[i], work.p[i] = ti.Vector.zero(model.real, 3), ti.Vector.zero(model.real, 3)
+                _begin_node(model, A, preconditioner, terms, work, chunk_entry(model, c, at, n), same_matrix)
     preconditioner.apply(model, work)
     fold(model, OTHER_SUM, OTHER_SUM, ())
     ti.loop_config(serialize=True)
@@ -137,9 +150,7 @@ def iterate(
         if task % model.spread == 0 and (work.state[STATUS] == RUNNING or work.state[STATUS] == NEGATIVE_PENDING):
             c, n, step = task // model.spread, model.n_nodes, ti.cast(work.state[STEP], model.real)
             for at in range(chunk_size(model, c, n)):
-                i = chunk_entry(model, c, at, n)
-                work.y[i] = work.y[i] + step * work.p[i]
-                work.r[i] = work.r[i] - step * work.q[i]
+                _move_node(work, chunk_entry(model, c, at, n), step)
     preconditioner.apply(model, work)
     fold(model, OTHER_SUM, OTHER_SUM, ())
     ti.loop_config(serialize=True)
@@ -169,18 +180,7 @@ def _multiply(model: ti.template(), A: ti.template(), terms: ti.template(), bord
             c, n, s = task // model.spread, model.n_nodes, ti.cast(0.0, ti.f64)
             if work.state[STATUS] == RUNNING:
                 for at in range(chunk_size(model, c, n)):
-                    i = chunk_entry(model, c, at, n)
-                    product = off_diagonal_times(model, A, c, i, work.p)
-                    if ti.static(terms.any):
-                        product += block_times(terms.base[i], work.p[i]) + gather_products(model, terms, i)
-                    else:
-                        product += block_times(A.diagonal[i], work.p[i])
-                    if ti.static(border.any):
-                        for k in range(border.n[0]):
-                            product += ti.cast(border.product[k] * border.row[k * model.n_nodes + i], model.real)
-                    q = model.free[i] * product
-                    work.q[i] = q
-                    s += dot64(work.p[i], q)
+                    s += _multiply_node(model, A, terms, border, work, c, chunk_entry(model, c, at, n))
             model.state.partial[c, SUM] = s
 
 
@@ -192,5 +192,145 @@ def _turn(model: ti.template(), work: ti.template()):
         if task % model.spread == 0 and work.state[STATUS] == RUNNING:
             c, n, ratio = task // model.spread, model.n_nodes, ti.cast(work.state[STEP], model.real)
             for at in range(chunk_size(model, c, n)):
-                i = chunk_entry(model, c, at, n)
-                work.p[i] = work.z[i] + ratio * work.p[i]
+                _turn_node(work, chunk_entry(model, c, at, n), ratio)
+
+
+# --- what each node does ----------------------------------------------------------------------------------------------
+
+
+@ti.func
+def _begin_node(
+    model: ti.template(),
+    A: ti.template(),
+    preconditioner: ti.template(),
+    terms: ti.template(),
+    work: ti.template(),
+    i,
+    same_matrix,
+):
+    """Prepare node i, at y = 0 with r = rhs and p = 0."""
+    preconditioner.prepare(model, A, terms, work, i, same_matrix)
+    work.r[i] = model.free[i] * work.rhs[i]
+    work.y[i], work.p[i] = ti.Vector.zero(model.real, 3), ti.Vector.zero(model.real, 3)
+
+
+@ti.func
+def _multiply_node(
+    model: ti.template(), A: ti.template(), terms: ti.template(), border: ti.template(), work: ti.template(), c, i
+):
+    """Set q of node i, in chunk c of a loop, from the products of terms and border; return its p.q."""
+    product = off_diagonal_times(model, A, c, i, work.p)
+    if ti.static(terms.any):
+        product += block_times(terms.base[i], work.p[i]) + gather_products(model, terms, i)
+    else:
+        product += block_times(A.diagonal[i], work.p[i])
+    if ti.static(border.any):
+        for k in range(border.n[0]):
+            product += ti.cast(border.product[k] * border.row[k * model.n_nodes + i], model.real)
+    q = model.free[i] * product
+    work.q[i] = q
+    return dot64(work.p[i], q)
+
+
+@ti.func
+def _move_node(work: ti.template(), i, step):
+    """y and r of node i after a step along p."""
+    work.y[i] = work.y[i] + step * work.p[i]
+    work.r[i] = work.r[i] - step * work.q[i]
+
+
+@ti.func
+def _turn_node(work: ti.template(), i, ratio):
+    """p of node i for the next step."""
+    work.p[i] = work.z[i] + ratio * work.p[i]
+
+
+# --- by a team --------------------------------------------------------------------------------------------------------
+
+
+@kernel
+def run_team(
+    model: ti.template(),
+    A: ti.template(),
+    preconditioner: ti.template(),
+    terms: ti.template(),
+    work: ti.template(),
+    tolerance: ti.f64,
+    same_matrix: ti.i32,
+    begins: ti.i32,
+    max_iterations: ti.i32,
+):
+    """Begin a solve, or go on with it (begins = 0), by TEAM_BATCH iterations at most; FAILED after max_iterations in all.
+
+    preconditioner: one that needs only a node at a time.
+    """
+    ti.loop_config(serialize=work.team.alone, block_dim=work.team.threads)
+    for t in range(work.team.threads):
+        if begins == 1:
+            _begin_by_team(model, A, preconditioner, terms, work, tolerance, same_matrix, t)
+        _iterate_by_team(model, A, preconditioner, terms, work, tolerance, max_iterations, t)
+
+
+@ti.func
+def _begin_by_team(
+    model: ti.template(),
+    A: ti.template(),
+    preconditioner: ti.template(),
+    terms: ti.template(),
+    work: ti.template(),
+    tolerance,
+    same_matrix,
+    t,
+):
+    """As `start`."""
+    rz = ti.cast(0.0, ti.f64)
+    for j in range(work.team.share(t, model.n_nodes)):
+        i = work.team.entry(t, j, model.n_nodes)
+        _begin_node(model, A, preconditioner, terms, work, i, same_matrix)
+        rz += preconditioner.apply_at(work, i)
+        _turn_node(work, i, ti.cast(0.0, model.real))
+    total_rz = work.team.total(t, rz)
+    if t == 0:
+        begin_with(work, tolerance, total_rz)
+    work.team.sync()
+
+
+@ti.func
+def _iterate_by_team(
+    model: ti.template(),
+    A: ti.template(),
+    preconditioner: ti.template(),
+    terms: ti.template(),
+    work: ti.template(),
+    tolerance,
+    max_iterations,
+    t,
+):
+    """As `iterate`, many times: all threads compute the same state, and the first one stores it at the end."""
+    n, rz, status, count = model.n_nodes, work.state[RZ], ti.cast(work.state[STATUS], ti.i32), ti.cast(work.state[COUNT], ti.i32)
+    last = ti.min(count + TEAM_BATCH, max_iterations)
+    while status == RUNNING and count < last:
+        if ti.static(terms.any):
+            for j in range(work.team.share(t, terms.count[0])):
+                form_product(model, terms, work.team.entry(t, j, terms.count[0]), work.p)
+            work.team.sync()
+        s = ti.cast(0.0, ti.f64)
+        for j in range(work.team.share(t, n)):
+            s += _multiply_node(model, A, terms, NO_BORDER, work, 0, work.team.entry(t, j, n))
+        pending, step = step_along(rz, work.team.total(t, s))
+        s = 0.0
+        for j in range(work.team.share(t, n)):
+            i = work.team.entry(t, j, n)
+            _move_node(work, i, ti.cast(step, model.real))
+            s += preconditioner.apply_at(work, i)
+        if pending == RUNNING:
+            before, rz = rz, work.team.total(t, s)
+            status, count = status_at(tolerance, rz, work.state[RZ_START]), count + 1
+            for j in range(work.team.share(t, n)):
+                _turn_node(work, work.team.entry(t, j, n), ti.cast(rz / before, model.real))
+            work.team.sync()
+        else:
+            status = NEGATIVE
+    if t == 0:
+        work.state[RZ], work.state[COUNT] = rz, count
+        work.state[STATUS] = ti.select(status == RUNNING and count >= max_iterations, FAILED, status)

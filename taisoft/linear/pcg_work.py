@@ -12,6 +12,7 @@ from typing import Any
 import taichi as ti
 
 from taisoft.backend.arrays import Count, FieldArena
+from taisoft.backend.team import Team, make_team
 from taisoft.fem.chunks import WHOLE, chunk_entry, chunk_size
 from taisoft.fem.model import Model
 from taisoft.fem.state import OTHER_SUM
@@ -21,6 +22,7 @@ from taisoft.linear.coupling import Coupling, has_terms, prepare_terms
 RZ, RZ_START, STEP, COUNT, STATUS = range(5)  # indices into `state`
 # NEGATIVE_PENDING: found in the present iteration; FAILED: rounding keeps the preconditioner from being positive definite
 RUNNING, CONVERGED, NEGATIVE, NEGATIVE_PENDING, FAILED = range(5)
+MOST_BY_TEAM = 2048  # nodes
 MAX_NEGATIVE_STEP = 10.0  # multiple of a direction of negative curvature; the caller's line search continues from there
 
 
@@ -36,6 +38,7 @@ class PcgWork:
     q: Any  # A p; Gauss-Seidel: (P + L)^-1 times it
     state: Any  # (5) f64
     inverse: Any  # (n_nodes) 12-vectors: of P, the diagonal blocks D of A or their replacements, 0 on constrained axes
+    team: Team | None = None  # that solves systems of up to MOST_BY_TEAM nodes on the GPU path
     block: Any = None  # (n_nodes) 12-vectors: P; Gauss-Seidel only
     mirror: Any = None  # (n_nodes) 12-vectors: 2 P - D; Gauss-Seidel only
     n_chunks: Count = 1  # of `gauss_seidel`
@@ -78,6 +81,7 @@ def build_pcg(model: Model, arena: FieldArena) -> PcgWork:
     blocks = ("inverse", "block", "mirror") if model.on_cpu else ("inverse",)
     state, shift = arena.field("pcg_state", ti.f64, 5), model.sweep.shift
     chunks = {"n_chunks": -(-model.n_nodes // 2**shift), "chunk_shift": shift, "divided": shift < WHOLE}
+    chunks["team"] = None if model.on_cpu or model.n_nodes > MOST_BY_TEAM else make_team(arena, "pcg")
     return PcgWork(**allocate("rhs", "y", "r", "z", "p", "q"), **allocate(*blocks, n=BLOCK), state=state, **chunks)
 
 
@@ -100,11 +104,11 @@ def precondition(model: ti.template(), A: ti.template(), terms: ti.template(), w
 def begin_with(work: ti.template(), tolerance, rz):
     """Set the state before the first iteration from r.z."""
     work.state[RZ], work.state[RZ_START], work.state[STEP], work.state[COUNT] = rz, rz, 0.0, 0.0
-    work.state[STATUS] = _status(tolerance, rz, rz)
+    work.state[STATUS] = status_at(tolerance, rz, rz)
 
 
 @ti.func
-def _status(tolerance, rz, start):
+def status_at(tolerance, rz, start):
     """Status at r.z, which was `start` at the start."""
     status = RUNNING
     if rz < 0.0:
@@ -115,15 +119,20 @@ def _status(tolerance, rz, start):
 
 
 @ti.func
+def step_along(rz, curvature):
+    """Return the status and the length of the step along p from r.z and p.Ap."""
+    status, step = RUNNING, rz / curvature
+    if not curvature > 0.0:
+        status, step = NEGATIVE_PENDING, MAX_NEGATIVE_STEP
+        if curvature < 0.0:
+            step = ti.min(rz, -MAX_NEGATIVE_STEP * curvature) / -curvature
+    return status, step
+
+
+@ti.func
 def set_step(work: ti.template(), curvature):
     """Set the length of the step along p from p.Ap."""
-    rz = work.state[RZ]
-    if not curvature > 0.0:
-        work.state[STATUS], work.state[STEP] = NEGATIVE_PENDING, MAX_NEGATIVE_STEP
-        if curvature < 0.0:
-            work.state[STEP] = ti.min(rz, -MAX_NEGATIVE_STEP * curvature) / -curvature
-    else:
-        work.state[STEP] = rz / curvature
+    work.state[STATUS], work.state[STEP] = step_along(work.state[RZ], curvature)
 
 
 @ti.func
@@ -132,7 +141,7 @@ def end_iteration(work: ti.template(), tolerance, rz):
     if work.state[STATUS] == RUNNING:
         work.state[STEP] = rz / work.state[RZ]
         work.state[RZ], work.state[COUNT] = rz, work.state[COUNT] + 1.0
-        work.state[STATUS] = _status(tolerance, rz, work.state[RZ_START])
+        work.state[STATUS] = status_at(tolerance, rz, work.state[RZ_START])
     elif work.state[STATUS] == NEGATIVE_PENDING:
         work.state[STATUS] = NEGATIVE
 

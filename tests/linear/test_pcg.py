@@ -1,5 +1,6 @@
-"""Conjugate gradients in f64, with block-Jacobi, and Gauss-Seidel over the whole system and over chunks, on one thread and on
-several: the solution is exact on the free axes and 0 on the others, limits hold, and negative curvature is reported.
+"""Conjugate gradients in f64, with block-Jacobi by loops and by teams, and Gauss-Seidel over the whole system and over chunks, on
+one thread and on several: the solution is exact on the free axes and 0 on the others, limits hold, and negative curvature is
+reported.
 """
 
 from dataclasses import replace
@@ -10,13 +11,17 @@ import scipy.sparse as sp
 import taichi as ti
 
 from taisoft.backend.arrays import FieldArena
+from taisoft.backend.counters import counting
+from taisoft.backend.paths import Order, gpu_path
 from taisoft.linear import block_csr, gauss_seidel, pcg
+from taisoft.linear.coupling import NO_COUPLING, Coupling, build_coupling
 from taisoft.linear.jacobi import JACOBI
-from taisoft.linear.pcg_work import build_pcg
+from taisoft.linear.pcg_work import RUNNING, LinearResult, build_pcg
 from tests.dynamics.scenes import built, mixed_scene
 from tests.linear.boxes import divided, fill
 
-PRECONDITIONERS = {"jacobi": JACOBI}  # of `pcg`
+TEAMS = {"team": Order(), "team of 7": Order(7), "team of 64, backwards": Order(64, True)}
+PRECONDITIONERS = dict.fromkeys(("jacobi", *TEAMS), JACOBI)  # of `pcg`
 METHODS = ("whole", "chunks", "threads", *PRECONDITIONERS)
 
 
@@ -28,7 +33,9 @@ def rig():
         models |= {name: divided(made.model, arenas[0], 4, serial=name == "chunks") for name in ("chunks", "threads")}
         for arena, (name, m) in zip(arenas, models.items()):
             of_cpu = models["whole"] if name in PRECONDITIONERS else m
-            made.ways[name] = m, block_csr.build_block_csr(of_cpu, arena), build_pcg(of_cpu, arena)
+            matrix = block_csr.build_block_csr(of_cpu, arena)
+            with gpu_path(TEAMS.get(name, Order())):
+                made.ways[name] = m, matrix, build_pcg(m if name in TEAMS else of_cpu, arena)
         assert made.ways["chunks"][2].n_chunks == 6 and made.ways["chunks"][1].crossed
         rng = np.random.default_rng(1)
         x = made.oracle.rest * [0.8, 1.1, 0.9] + 0.05 * rng.standard_normal(made.oracle.rest.shape)
@@ -89,6 +96,64 @@ def test_threads_give_the_same_bits_and_gauss_seidel_takes_fewer_iterations(rig,
         assert again[0] == found["chunks"][0] and np.array_equal(again[1], found["chunks"][1])
     whole, chunks, jacobi = (found[method][0].iterations for method in ("whole", "chunks", "jacobi"))
     assert whole < 0.8 * jacobi and chunks < 0.9 * jacobi
+
+
+def with_terms(rig, arena: FieldArena, n: int = 40) -> tuple[Coupling, np.ndarray]:
+    """Random terms of up to six nodes, most of them active, and the matrix that they add."""
+    rng, n_nodes, size = np.random.default_rng(5), rig.model.n_nodes, 3 * rig.model.n_nodes
+    arity, active = rng.integers(1, 7, n).astype(np.int32), (rng.random(n) < 0.8).astype(np.int32)
+    contact, node = np.repeat(np.arange(n), arity), rng.integers(0, n_nodes, arity.sum())
+    weight, roots = rng.standard_normal(len(node)), 30.0 * rng.standard_normal((n, 3, 3))
+    blocks = roots @ roots.swapaxes(1, 2)
+    J = np.zeros((n, 3, size))
+    for c, i, w in zip(contact, node, weight):
+        J[c, :, 3 * i : 3 * i + 3] += w * np.eye(3)
+    base = [block_csr.to_bsr(*rig.ways["jacobi"][:2]).toarray()[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] for i in range(n_nodes)]
+    integers = {"count": [n], "first": np.cumsum(arity) - arity, "arity": arity, "node": node, "contact": contact}
+    integers |= {"entry_start": np.append(0, np.cumsum(np.bincount(node, minlength=n_nodes))), "active": active}
+    integers["entry"] = np.argsort(node, kind="stable")
+    fields = {k: arena.field(k, ti.i32, len(v), np.asarray(v, dtype=np.int32)) for k, v in integers.items()}
+    fields["weight"] = arena.field("weight", ti.f64, len(weight), weight)
+    fields["block"] = arena.vectors("block", ti.f64, n, block_csr.packed(blocks), n=12)
+    fields["base"] = arena.vectors("base", ti.f64, n_nodes, block_csr.packed(np.array(base)), n=12)
+    return build_coupling(arena, ti.f64, n_nodes, **fields), np.einsum("c,cai,cab,cbj->ij", active, J, blocks, J)
+
+
+def test_teams_solve_as_loops_do_with_terms_in_any_order(rig, exact):
+    """Up to rounding of the sums, whose order is that of the entries, and whatever the number of iterations in a launch."""
+    arena, f = FieldArena(), rig.free.reshape(-1)
+    terms, added = with_terms(rig, arena)
+    A = (block_csr.to_bsr(*rig.ways["jacobi"][:2]).toarray() + added)[f][:, f]
+    expected, found = np.zeros(len(f)), {}
+    expected[f] = np.linalg.solve(A, rig.rhs.reshape(-1)[f])
+    for method in ("jacobi", *TEAMS):
+        model, matrix, work = rig.ways[method]
+        for again in (False, True):  # with the diagonal of the last solve
+            work.rhs.from_numpy(rig.rhs)
+            result = pcg.solve(model, matrix, JACOBI, work, 1e-11, 1000, terms, again)
+            assert result.converged
+            assert np.abs(work.y.to_numpy().reshape(-1) - expected).max() < 1e-9 * np.abs(expected).max()
+        short = pcg.solve(model, matrix, JACOBI, work, 1e-3, 1000, terms, True), work.y.to_numpy()
+        found[method] = result.iterations, short
+    n, (loops, y) = found["jacobi"]
+    for n_team, (short, y_team) in found.values():
+        assert abs(n_team - n) <= 2 and short == loops  # rounding adds up over the first ones
+        assert np.abs(y_team - y).max() < 1e-10 * np.abs(y).max()
+    arena.release()
+
+
+def test_a_solve_by_a_team_goes_on_after_a_launch(rig, exact):
+    model, matrix, work = rig.ways["team"]
+    work.rhs.from_numpy(rig.rhs)
+    with counting() as counts:
+        whole = pcg.solve(model, matrix, JACOBI, work, 1e-12, 1000)
+    assert whole.converged and counts.launches.total() == 1 and sum(counts.accesses.values()) == 1
+    y = work.y.to_numpy()
+    pcg.run_team(model, matrix, JACOBI, NO_COUPLING, work, 1e-12, 0, 1, 5)
+    assert work.result(1000) == LinearResult(5, False, False)
+    work.state.from_numpy(np.array([*work.state.to_numpy()[:4], RUNNING]))
+    pcg.run_team(model, matrix, JACOBI, NO_COUPLING, work, 1e-12, 0, 0, 1000)
+    assert work.result(1000) == whole and np.array_equal(work.y.to_numpy(), y)
 
 
 def test_a_border_is_part_of_the_matrix(rig, exact):
