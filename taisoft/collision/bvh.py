@@ -228,6 +228,8 @@ class Bvh:
             refit_level(self.trees, int(begin), int(end))
         return self.trees
 
+    search = near  # as of `SpatialHash`
+
     @property
     def buffers(self) -> tuple[Buffer, ...]:
         """The growing buffers."""

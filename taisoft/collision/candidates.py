@@ -9,6 +9,7 @@ The contact search does not read whole rows: it asks for the triangles near one 
 the step, padded by half the reach, is small, and the list is needed only while one query is processed.
 """
 
+import itertools
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -16,8 +17,9 @@ from typing import Any
 import numpy as np
 import taichi as ti
 
-from taisoft.backend.arrays import Count, FieldArena, download
+from taisoft.backend.arrays import Array, Count, FieldArena, download
 from taisoft.backend.lists import part_first
+from taisoft.backend.reader import read_each
 from taisoft.backend.runtime import kernel
 from taisoft.collision.surface import ACTIVE, Surface, ivec, list_near, may_touch
 from taisoft.errors import SimulationError
@@ -45,7 +47,7 @@ class Buffer:
         self.name, self._make, self.max_capacity, self.chunks = name, make, max_capacity, chunks
         self.count = arena.field(f"{name}_count", ti.i32, 2)
         self.used = arena.field(f"{name}_used", ti.i32, chunks)
-        self.growths = 0
+        self.growths, self.total = 0, 0  # the latter: entries of all parts at the last look
         self._arena: FieldArena | None = None
         self._allocate(capacity)
 
@@ -83,12 +85,17 @@ class Buffer:
         """Which entries the last search has filled, (capacity,) bool. used: downloaded, (chunks,)."""
         return np.arange(self.capacity) % self.part < np.repeat(used, self.part)
 
-    def grow_if_full(self) -> bool:
+    @property
+    def counts(self) -> list[Array]:
+        """What `grow_if_full` looks at."""
+        return [self.count]
+
+    def grow_if_full(self, counts: list[list[int]] | None = None) -> bool:
         """Grow if the last search did not fit. Return True if it has grown, so that the search must be repeated.
 
-        Raise SimulationError if max_capacity does not allow it.
+        counts: the numbers of `counts`, None to read them. Raise SimulationError if max_capacity does not allow it.
         """
-        needed = self.count[NEEDED]
+        ((needed, self.total),) = counts or read_each([self.count])
         if needed <= self.part:
             return False
         required = needed * self.chunks
@@ -111,11 +118,22 @@ def entries(arena: FieldArena, capacity: int):
     return arena.field("entry", ti.i32, capacity)
 
 
-def fill(search: Callable[[], None], *buffers: Buffer) -> None:
-    """Run a search, again and again until all that it finds fits into its buffers."""
-    search()
-    while sum([buffer.grow_if_full() for buffer in buffers]):  # each of them
+def fill(
+    search: Callable[[], None],
+    *buffers: Buffer,
+    read: Callable[[list[Array]], list[list]] = read_each,
+    also: Callable[[], list[Array]] = list,
+) -> list[list]:
+    """Run a search, again and again until all that it finds fits into its buffers.
+
+    read: of small arrays; also: further ones that the search sets. Return the numbers of these.
+    """
+    while True:
         search()
+        counts = [buffer.counts for buffer in buffers]
+        found = iter(read([*itertools.chain(*counts), *also()]))
+        if not sum([buffer.grow_if_full([next(found) for _ in own]) for buffer, own in zip(buffers, counts)]):  # each of them
+            return list(found)
 
 
 @ti.func

@@ -12,8 +12,9 @@ from typing import Any
 import numpy as np
 import taichi as ti
 
-from taisoft.backend.arrays import FieldArena
-from taisoft.collision.candidates import TOTAL, Buffer
+from taisoft.backend.arrays import Array, FieldArena
+from taisoft.backend.reader import read_each
+from taisoft.collision.candidates import Buffer
 from taisoft.collision.surface import dvec, ivec
 from taisoft.display import short_repr
 from taisoft.ranges import expand
@@ -188,10 +189,16 @@ class ContactBuffer(Buffer):
             vertex, weight = self.lists.data
             self.parts = replace(self.parts, data=replace(self.data, vertex=vertex, weight=weight))
 
-    def grow_if_full(self) -> bool:
+    @property
+    def counts(self) -> list[Array]:
         """See Buffer."""
-        grown = super().grow_if_full()
-        grown |= self.lists is not None and self.lists.grow_if_full()
+        return [self.count] if self.lists is None else [self.count, self.lists.count]
+
+    def grow_if_full(self, counts: list[list[int]] | None = None) -> bool:
+        """See Buffer."""
+        counts = counts or read_each(self.counts)
+        grown = super().grow_if_full(counts[:1])
+        grown |= self.lists is not None and self.lists.grow_if_full(counts[1:])
         if grown:
             self._join()
         return grown
@@ -199,7 +206,7 @@ class ContactBuffer(Buffer):
     @property
     def n_listed(self) -> int:
         """Vertices of all mortar contacts."""
-        return 0 if self.lists is None else self.lists.count[TOTAL]
+        return 0 if self.lists is None else self.lists.total
 
     @property
     def bytes(self) -> int:

@@ -4,12 +4,14 @@ Only what a scene needs is allocated and launched: candidates need two surfaces,
 distances an analytic obstacle.
 """
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 import taichi as ti
 
-from taisoft.backend.arrays import FieldArena, download
+from taisoft.backend.arrays import Array, FieldArena, download
+from taisoft.backend.reader import Reader
 from taisoft.backend.runtime import Runtime
 from taisoft.collision.analytic import NO_SHAPES, AnalyticFrames, build_analytic, find_analytic
 from taisoft.collision.bvh import Bvh, Trees
@@ -129,6 +131,7 @@ class Detection:
         self._placed = [MOVING] * len(obstacles)  # the paths at whose ends obstacles rest, as they were last placed
         self._frames = AnalyticFrames(self.shapes, self._analytic)
         self._broad_result: Trees | Candidates | None = None  # broad-phase result of the last search
+        self._read, self._surface_counts = Reader(arena, "search"), [0] * 4  # the latter: those of the surface as they were read
         self.counts = Counts(triangles=s.n_triangles)
 
     def _checked_margin(self) -> float:
@@ -177,17 +180,31 @@ class Detection:
         """
         if self.only_shapes and not len(held.pairs):
             motion = self.motion(time, dt, prescribed, path)
-            fill(lambda: self.search_shapes(motion, none_cross), self.buffer)
-            self._refuse_nonfinite()
-            self._reduction.read()
+
+            def search() -> None:
+                self.search_shapes(motion, none_cross)
         else:
             self._move(time, dt, prescribed, path)
-            self._broad_result = self._near()
             if self.overlay is not None and none_cross != self._none_cross:
                 self._none_cross, self.overlay.behind[0] = none_cross, self.floor if none_cross else np.inf
-            fill(lambda: self._fill_buffer(self._broad_result, held), *self._scratch(), self.buffer)
-            self._reduction.reduce(self._lowest_gap(none_cross))
-        self._count()
+
+            def search() -> None:
+                self._broad_result = self._near()
+                self._fill_buffer(self._broad_result, held)
+                self._reduction.launch(self._lowest_gap(none_cross))
+
+        unmapped = [] if self._fields is None else [self._fields.unmapped]
+        found = self._fill(search, self.buffer, lambda: [self._reduction.work.count, *unmapped])
+        self._refuse_nonfinite(self._surface_counts)
+        self._reduction.read(found[0])
+        self._count(found[1:])
+
+    def _fill(self, search: Callable[[], None], out: ContactBuffer, also: Callable[[], list]) -> list[list]:
+        """Run a search until it fits, and read the surface's counts, too; see `candidates.fill`."""
+        broad = self.broad.buffers if self.has_pairs else ()
+        given = {"read": self._read, "also": lambda: [self.surface.count, *also()]}
+        self._surface_counts, *found = fill(search, *broad, *self._scratch(), out, **given)
+        return found
 
     def _lowest_gap(self, none_cross: bool) -> float:
         """Gap [m] below which contacts are dropped: if none cross, a vertex behind a face is not inside."""
@@ -223,12 +240,8 @@ class Detection:
     def _move(self, time: float, dt: float, prescribed=None, path=None, x=None) -> None:
         """Update positions and displacements of the surface, and the boxes; the arguments are those of `motion`."""
         update_surface(self.surface, *self.motion(time, dt, prescribed, path, x), self.reach, self.has_pairs)
-        self._refuse_nonfinite()
-
-    def _refuse_nonfinite(self) -> None:
-        """Raise SimulationError if positions are not finite."""
-        if self.surface.count[NONFINITE]:
-            raise SimulationError(self._nonfinite())
+        if self.model.on_cpu:  # else it is seen after the search
+            self._refuse_nonfinite(self.surface.count.to_numpy())
 
     def _place_obstacles(self, time: float, dt: float) -> None:
         """Place the obstacles at a time [s] and at the end of the step; those that rest are placed once."""
@@ -245,17 +258,20 @@ class Detection:
                 self.surface.move.from_numpy(then - now, begin)
         self._frames.place((row for row, (k, _) in enumerate(self._analytic) if k in moved), time, dt)
 
-    def _nonfinite(self) -> str:
+    def _refuse_nonfinite(self, count: list[int]) -> None:
+        """Raise SimulationError if positions are not finite, by the counts of the surface."""
+        if not count[NONFINITE]:
+            return
         x, move = download([self.surface.x, self.surface.move])
         bad = int(np.argmin((np.isfinite(x) & np.isfinite(x + move)).all(axis=1)))
         k = int(np.searchsorted(self.topology.vertex_first, bad, side="right")) - 1
         node = self.topology.node[bad] - self.layout.node_start[k] if k < len(self.scene.bodies) else bad
         name = self.scene.colliders[k].name
-        return f"body '{name}', node {node}: position or velocity is not finite, so no contact can be found"
+        raise SimulationError(f"body '{name}', node {node}: position or velocity is not finite, so no contact can be found")
 
     def _near(self) -> Trees | Candidates | None:
-        """Run the broad phase; None if no two surfaces can touch."""
-        return self.broad.near() if self.has_pairs else None
+        """Run the broad phase, whose buffers may be full; None if no two surfaces can touch."""
+        return self.broad.search() if self.has_pairs else None
 
     def _fill_buffer(self, near: Trees | Candidates | None, held: HeldPassages) -> None:
         """Write the contacts before reduction, as many as fit."""
@@ -289,38 +305,49 @@ class Detection:
         """Take over the numbers of contacts of a search that was not read, in a scene with `only_shapes`."""
         self._reduction.n_found, self._reduction.n_kept = self.counts.found, self.counts.contacts = found, kept
 
-    def _count(self) -> None:
-        """Update the counts."""
-        count, surface = self.counts, self.surface.count
+    def _count(self, unmapped: list[list[int]]) -> None:
+        """Update the counts. unmapped: of distance fields, if there are any."""
+        count = self.counts
         if self.has_pairs:
-            count.active, count.pairs = surface[ACTIVE], surface[PAIRS]
-        if self._fields is not None:
-            count.unmapped = self._fields.unmapped[0]
+            count.active, count.pairs = self._surface_counts[ACTIVE], self._surface_counts[PAIRS]
+        if unmapped:
+            count.unmapped = unmapped[0][0]
         count.found, count.contacts = self._reduction.n_found, self._reduction.n_kept
         count.growths = {b.name: b.growths for b in self._buffers()}
 
-    def find_at_end(self, time: float, dt: float, x_start, displacement, farthest: float) -> EndSearch | None:
+    def find_at_end(
+        self, time: float, dt: float, x_start, displacement, farthest: float, also: Sequence[Array] = ()
+    ) -> EndSearch | None:
         """Find the contacts at displacements from x_start, (n_nodes) [m] each, with obstacles as at the end of a step of dt.
 
         time: of the step's start. The last search must have been that of the step; it is repeated along these displacements if
         they leave its paths, and None returned if that is by more than `farthest` [m]. Surfaces may cross there.
+        also: small arrays that are read as well, for `EndSearch.also`.
         """
         if self.end is None:
             self.end = EndSearch(self.surface, self.shapes, self.buffer, self._lengths)
-        end, place = self.end, (displacement, self.reach, self.end.left)
-        place_at_end(self.surface, end.surface, *place)
-        if not end.left[0] <= farthest:
-            return None
-        if end.left[0] > IN_BOXES * self.reach:
+        end, limit, moves = self.end, IN_BOXES * self.reach, False
+
+        def search() -> None:
+            if moves:
+                self._broad_result = self._near()
+            self._fill_with(self._broad_result, end)
+            end.reduction.launch(-np.inf)
+
+        while True:
+            place_at_end(self.surface, end.surface, displacement, self.reach, end.left)
+            left = end.left[0] if self.model.on_cpu and not moves else 0.0  # a GPU had better search than be asked before
+            if moves or left <= limit:
+                (left,), count, *end.also = self._fill(search, end.buffer, lambda: [end.left, end.reduction.work.count, *also])
+            if not moves and not left <= farthest:
+                return None
+            if moves:
+                self._refuse_nonfinite(self._surface_counts)
+            if moves or left <= limit:
+                end.reduction.read(count)
+                return end
             self._move(time, dt, None, displacement, x_start)
-            self._broad_result = self._near()
-            place_at_end(self.surface, end.surface, *place)
-        unmapped = 0 if self._fields is None else self._fields.unmapped[0]
-        fill(lambda: self._fill_with(self._broad_result, end), *self._scratch(), end.buffer)
-        end.reduction.reduce(-np.inf)
-        if self._fields is not None:
-            self._fields.unmapped[0] = unmapped
-        return end
+            moves = True
 
     def let_rest(self, colliders: np.ndarray) -> bool:
         """Let colliders (n,) bool rest from now on, and no others: they are not tested against each other. Return whether some
@@ -389,10 +416,10 @@ class Detection:
         options = self._self_on, self.has_pairs, self.reach, self.floor, self._arena, *limits
         self.paths = PathCheck(self.surface, self.topology, self.shapes, *options)
 
-    def passages(self, mode: int) -> tuple[np.ndarray, np.ndarray] | None:
+    def passages(self, mode: int, also: Sequence[Array] = ()) -> tuple[np.ndarray, np.ndarray] | None:
         """Return the passages (k,4) on the paths from the positions of the last search, and the parts (k,) of the step until
         which they are apart, or None, see `PathCheck.find`."""
-        return self.paths.find(self.model.state.x, self._broad_result, self._near_buffer, mode)
+        return self.paths.find(self.model.state.x, self._broad_result, self._near_buffer, mode, also)
 
     def bends(self, mode: int) -> bool:
         """Return whether a bent path is free instead of a straight one of that mode."""

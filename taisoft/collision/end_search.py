@@ -46,6 +46,7 @@ class EndSearch:
         self._arena, n, v = FieldArena(), max(start.n_triangles, 1), max(start.n_verts, 1)
         own = {name: self._arena.vectors(f"end_{name}", ti.f64, v) for name in ("x", "move")}
         own |= {name: self._arena.vectors(f"end_{name}", ti.f64, n) for name in ("lo", "hi", "normal")}
+        self.also: list[list] = []  # numbers that the last search has read for others
         self.left = self._arena.field("end_left", ti.f64, 1)
         self.surface = replace(start, **own, area=self._arena.field("end_area", ti.f64, n))
         self.shapes = replace(shapes, origin=shapes.next_origin, rotation=shapes.next_rotation)

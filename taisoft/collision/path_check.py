@@ -1,16 +1,18 @@
 """The check of a step's paths: lists of pairs, exempt colliders, and the passages found; see `passages`."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
 import taichi as ti
 
-from taisoft.backend.arrays import FieldArena, download
+from taisoft.backend.arrays import Array, FieldArena, download
+from taisoft.backend.reader import Reader
 from taisoft.collision.analytic import AnalyticObstacles
 from taisoft.collision.bent_path import TRIALS, find_inwards, set_leg
 from taisoft.collision.bvh import Trees
-from taisoft.collision.candidates import TOTAL, Buffer, Pairs, fill, list_pairs, pair_entries
+from taisoft.collision.candidates import Buffer, Pairs, fill, list_pairs, pair_entries
 from taisoft.collision.colliders import Topology
 from taisoft.collision.near_list import GIVEN, HINTS, OUTDATED, SEARCHED, STILL, TO_STATE, UNCOVERED, PathFields
 from taisoft.collision.passages import ADJACENT, FLAT, N_KINDS, NEAR, ROUND, check_paths, passage_fields
@@ -104,7 +106,8 @@ class PathCheck:
         limits = capacity or (4 * n_listed + 64 if has_pairs else 1), max_capacity
         self.near = Buffer("near_pairs", pair_entries, *limits, s.chunks, arena)
         self.passages = Buffer("passages", passage_fields, 64 * s.chunks, max_capacity, s.chunks, arena)
-        self._is_listed, self._arena = False, arena
+        self._is_listed, self._arena, self._read_small = False, arena, Reader(arena, "path")
+        self.also: list[list] = []  # numbers that the last check has read for others
         self._leg: Surface | None = None  # of bent paths, allocated at first use
         self._inwards: Any = None
 
@@ -154,7 +157,9 @@ class PathCheck:
 
     def _list(self, broad, row: Buffer) -> None:
         """List the near pairs of the last search."""
-        fill(lambda: list_pairs(self.surface, broad, row.parts, NEAR_PAIRS, self.near.parts), row, self.near)
+        fill(
+            lambda: list_pairs(self.surface, broad, row.parts, NEAR_PAIRS, self.near.parts), row, self.near, read=self._read_small
+        )
         self._is_listed = True
 
     def _listed_limit(self, broad) -> float:
@@ -162,14 +167,14 @@ class PathCheck:
         apart along other directions only."""
         return 2.0 * self.limit / (np.sqrt(3.0) if isinstance(broad, Trees) and broad.slabs > 3 else 1.0)
 
-    def find(self, x, broad, row: Buffer | None, mode: int) -> tuple[np.ndarray, np.ndarray] | None:
+    def find(self, x, broad, row: Buffer | None, mode: int, also: Sequence[Array] = ()) -> tuple[np.ndarray, np.ndarray] | None:
         """Return the passages (k,4), ordered, and the parts (k,) of the step until which they are apart; None if the paths leave
         what the last search has covered.
 
         x: field of the nodes' positions [m]; mode: which paths, see `check_paths`. broad, row: result of the last broad phase and
-        buffer of its rows, or None.
+        buffer of its rows, or None. also: small arrays that are read as well, into `also`.
         """
-        return self._check(self.surface, x, broad, row, mode, 0.0, float(mode != STILL))
+        return self._check(self.surface, x, broad, row, mode, 0.0, float(mode != STILL), also)
 
     def bends(self, x, broad, row: Buffer | None, mode: int, margin: float) -> bool:
         """Return whether a bent path is free, see `bent_path`. margin [m]: of the detection; the others are as for `find`."""
@@ -204,7 +209,7 @@ class PathCheck:
         return False
 
     def _check(
-        self, s: Surface, x, broad, row: Buffer | None, mode: int, begin: float, end: float
+        self, s: Surface, x, broad, row: Buffer | None, mode: int, begin: float, end: float, also: Sequence[Array] = ()
     ) -> tuple[np.ndarray, np.ndarray] | None:
         """See `find`; surface s is that of the last search, or a leg between two parts of the step: None if the list is of no use
         for that."""
@@ -216,13 +221,14 @@ class PathCheck:
             limit, listed_limit = self.limit if covers else np.inf, np.inf if is_new or not covers else self._listed_limit(broad)
             lists = self.near.parts, self.passages.parts
             check_paths(s, x, self.shapes, self.fields, *lists, mode, begin, end, limit, listed_limit, self.floor, 0)
-            if self.fields.left[UNCOVERED]:
+            left, count, *self.also = self._read_small([self.fields.left, self.passages.count, *also])
+            if left[UNCOVERED]:
                 return None
-            if self.fields.left[OUTDATED]:
+            if left[OUTDATED]:
                 self._is_listed = False
                 if s is not self.surface:
                     return None
-            elif not self.passages.grow_if_full():
+            elif not self.passages.grow_if_full([count]):
                 break
         return self._read()
 
@@ -234,7 +240,7 @@ class PathCheck:
     def _read(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the passages found."""
         out = self.passages
-        if out.count[TOTAL] == 0:
+        if out.total == 0:
             return NO_PASSAGES
         pair, time, used = download([out.data.pair, out.data.time, out.used])
         filled = out.filled(used)

@@ -243,10 +243,9 @@ class Reduction:
         self._surface, self._buffer, self._lengths = surface, buffer, (tolerance, cell)
         self._arena, self.work = FieldArena(), None
 
-    def reduce(self, lowest_gap: float) -> None:
-        """Reduce the contacts in the buffer. lowest_gap [m]: of surfaces that do not cross."""
+    def launch(self, lowest_gap: float) -> None:
+        """Reduce the contacts in the buffer, if they fit. lowest_gap [m]: of surfaces that do not cross."""
         reduce_contacts(self.prepare(), self._buffer.parts, *self._lengths, lowest_gap)
-        self.read()
 
     @property
     def scales(self) -> tuple[float, float]:
@@ -264,9 +263,9 @@ class Reduction:
             self._arena = arena
         return self.work
 
-    def read(self) -> None:
-        """Read the numbers of contacts."""
-        self.n_found, self.n_kept = self.work.count.to_numpy(2).tolist()
+    def read(self, count: list[int]) -> None:
+        """Take the numbers of contacts from the workspace's count."""
+        self.n_found, self.n_kept = count[:2]
 
     @property
     def bytes(self) -> dict[str, int]:

@@ -25,7 +25,7 @@ from taisoft.backend.lists import (
     sort_range,
 )
 from taisoft.backend.runtime import kernel
-from taisoft.collision.candidates import Buffer, Candidates, entries, fill, sum_parts
+from taisoft.collision.candidates import NEEDED, Buffer, Candidates, entries, fill, sum_parts
 from taisoft.collision.surface import ACTIVE, Surface, cell_of, ivec, may_touch
 
 LARGE = 512  # cells above which a triangle counts as large
@@ -100,8 +100,11 @@ def _bucket(grid: ti.template(), first, count, k):
 
 
 @kernel
-def list_cells(surface: ti.template(), grid: ti.template(), inverse: ti.f64):
-    """Find the cells of each active triangle and where the list of each cell starts; list the large triangles."""
+def list_cells(surface: ti.template(), grid: ti.template(), members: ti.template(), inverse: ti.f64):
+    """Find the cells of each active triangle and where the list of each cell starts; list the large triangles.
+
+    members: buffer of the triangles by cell, whose needed size is set.
+    """
     clear_counts(grid.cells, grid.n_cells)
     ti.loop_config(serialize=surface.serial)
     for i in range(surface.count[ACTIVE]):
@@ -121,17 +124,26 @@ def list_cells(surface: ti.template(), grid: ti.template(), inverse: ti.f64):
                 n += 1
         grid.count[N_LARGE] = n
     add_up_counts(grid.cells, grid.n_cells)
+    ti.loop_config(serialize=True)
+    for _ in range(1):
+        members.count[NEEDED] = grid.cells.start[grid.n_cells + 1]
+
+
+@ti.func
+def _n_active(surface: ti.template(), members: ti.template()):
+    """The number of active triangles; 0 if they do not fit into their cells, so that the search is repeated."""
+    return ti.select(members.count[NEEDED] <= members.part, surface.count[ACTIVE], 0)
 
 
 @kernel
-def fill_cells(surface: ti.template(), grid: ti.template(), member: ti.template()):
+def fill_cells(surface: ti.template(), grid: ti.template(), members: ti.template()):
     """Write the active triangles into their cells; the order within a cell depends on the threads."""
     ti.loop_config(serialize=surface.serial)
-    for i in range(surface.count[ACTIVE]):
+    for i in range(_n_active(surface, members)):
         t = surface.active[i]
         first, count = grid.first_cell[t], grid.cell_count[t]
         for k in range(count[0] * count[1] * count[2]):
-            member[place_of_entry(grid.cells, _bucket(grid, first, count, k))] = t
+            members.data[place_of_entry(grid.cells, _bucket(grid, first, count, k))] = t
 
 
 @ti.func
@@ -146,7 +158,7 @@ def _is_pair(surface: ti.template(), t, u):
 
 
 @kernel
-def find_rows(surface: ti.template(), grid: ti.template(), member: ti.template(), out: ti.template()):
+def find_rows(surface: ti.template(), grid: ti.template(), members: ti.template(), out: ti.template()):
     """Write each active triangle's row, sorted; each chunk fills its own part of the entries."""
     ti.loop_config(serialize=surface.serial)
     for t in range(surface.n_triangles):
@@ -156,10 +168,8 @@ def find_rows(surface: ti.template(), grid: ti.template(), member: ti.template()
     for task in range(surface.chunks * surface.spread):
         if task % surface.spread == 0:
             c = task // surface.spread
-            at, last = c * out.part, (c + 1) * out.part
-            for i in range(
-                part_first(c, surface.count[ACTIVE], surface.chunks), part_first(c + 1, surface.count[ACTIVE], surface.chunks)
-            ):
+            at, last, n = c * out.part, (c + 1) * out.part, _n_active(surface, members)
+            for i in range(part_first(c, n, surface.chunks), part_first(c + 1, n, surface.chunks)):
                 t = surface.active[i]
                 begin = at
                 own = surface.body[t]
@@ -168,7 +178,7 @@ def find_rows(surface: ti.template(), grid: ti.template(), member: ti.template()
                 for k in range(count[0] * count[1] * count[2]):
                     bucket = _bucket(grid, first, count, k)
                     for e in range(grid.cells.start[bucket], grid.cells.start[bucket + 1]):
-                        u = member[e]
+                        u = members.data[e]
                         if surface.body[u] != own or self_on == 1:
                             if _is_pair(surface, t, u) == 1:
                                 if _index(grid, ti.select(surface.lo[t] >= surface.lo[u], first, grid.first_cell[u])) == bucket:
@@ -212,15 +222,18 @@ class SpatialHash:
         self.members = Buffer("hash_cells", entries, capacity or 8 * n + 64, max_capacity, 1, arena)
         self.rows = Buffer("hash_rows", entries, capacity or ENTRIES_PER_TRIANGLE * n + 64, max_capacity, surface.chunks, arena)
 
-    def near(self) -> Candidates:
-        """Return the candidates of the present boxes, for queries. Raise SimulationError if a buffer would outgrow its limit."""
+    def search(self) -> Candidates:
+        """Return the candidates of the present boxes, for queries; they are some of them only if a buffer is full."""
         surface, grid = self.surface, self.grid
-        list_cells(surface, grid, 1.0 / self.cell)
-        self.members.count[0] = grid.cells.start[grid.n_cells + 1]
-        self.members.grow_if_full()
-        fill_cells(surface, grid, self.members.data)
-        fill(lambda: find_rows(surface, grid, self.members.data, self.rows.parts), self.rows)
+        list_cells(surface, grid, self.members.parts, 1.0 / self.cell)
+        fill_cells(surface, grid, self.members.parts)
+        find_rows(surface, grid, self.members.parts, self.rows.parts)
         return Candidates(grid.start, grid.end, self.rows.data)
+
+    def near(self) -> Candidates:
+        """Do as `search`, until they fit. Raise SimulationError if a buffer would outgrow its limit."""
+        fill(self.search, *self.buffers)
+        return Candidates(self.grid.start, self.grid.end, self.rows.data)
 
     @property
     def buffers(self) -> tuple[Buffer, ...]:

@@ -125,7 +125,7 @@ class ContactStep:
         self.dropped = 0  # triangles of the last step under an inverted tet, for which a distance field gives no contacts
 
     def _allocate(self, capacity: int, entries: int) -> None:
-        arena, model = FieldArena(), self.simulation.model
+        arena, model, self._n_contacts = FieldArena(), self.simulation.model, None
         self.problem = build_node_problem(arena, capacity, model.n_nodes, model.on_cpu, entries)  # of the last step begun
         self._arena.release()
         self._arena, self._last_time, self._indexed = arena, 0.0, False
@@ -151,7 +151,9 @@ class ContactStep:
     @property
     def n_contacts(self) -> int:
         """Contacts of the last step, including those without impulse, but not those of sleeping bodies."""
-        return int(self.problem.count[0])
+        if self._explicit or self._n_contacts is None:
+            self._n_contacts = int(self.problem.count[0])
+        return self._n_contacts
 
     @property
     def n_asleep(self) -> int:
@@ -181,6 +183,7 @@ class ContactStep:
         self.far.forget()
         if with_impulses:
             self.problem.count[0], self._last_time, self._search_counts, self._renewal.sides = 0, 0.0, (0, 0), None
+            self._n_contacts = 0
 
     def snapshot(self) -> dict:
         """Return the last step's contacts and impulses, and the capacities: a step that exceeds them starts without impulses.
@@ -213,6 +216,7 @@ class ContactStep:
         if room != (self.problem.capacity, self.problem.node.shape[0]):
             self._allocate(*room)
         write_rows(self.problem, kept["rows"])
+        self._n_contacts = None
         self._last_time, self._impulse_fraction, self._step_dt = (float(kept[name]) for name in ("last_time", "share", "span"))
         self._pairs, self.penetration = (kept["pairs"], kept["pair_sums"]), float(kept["penetration"])
         self.relative_penetration = float(kept["relative_penetration"])
@@ -305,7 +309,7 @@ class ContactStep:
         if not self._explicit:
             set_targets(problem, dt, *self.gap_targets)
         self._renewal.sides, self._renewal.n_looks = self.detection.sides(kept.to_numpy(n)) if model.has_dependents else None, 0
-        self._last_time, self._impulse_fraction, self.had_impact = dt, 1.0, False
+        self._last_time, self._impulse_fraction, self.had_impact, self._n_contacts = dt, 1.0, False, n
         return n
 
     def warm_factor(self, dt: float) -> float:
@@ -339,15 +343,19 @@ class ContactStep:
         needed = renewal.look(self.problem, time, dt, x_start, displacement, self.contact_offset)
         if not needed:
             return False
+        self._n_contacts = renewal.n_contacts
         entries = most_entries(self.simulation.model, needed - self.n_contacts, self.detection.end.buffer.n_listed)
-        if room := self._room(needed, int(self.problem.count[2]) + entries):
+        if room := self._room(needed, renewal.n_entries + entries):
             last_time, rows, mass = self._last_time, read_rows(self.problem, MORE_ROWS), self.problem.inverse_mass.to_numpy()
             self._allocate(*room)
             upload([(self.problem.inverse_mass, mass)])
             write_rows(self.problem, rows)
             index_nodes(self.problem)
             self._last_time, self._indexed = last_time, True
-        return renewal.adopt(self.problem, self.numbers, self._step_dt, x_start, displacement, self.contact_offset)
+        adopted = renewal.adopt(self.problem, self.numbers, self._step_dt, x_start, displacement, self.contact_offset)
+        if adopted:
+            self._n_contacts = None
+        return adopted
 
     def set_impulse_fraction(self, fraction: float) -> None:
         """Set the fraction of the step in which impulses act, beta / dt of an implicit stage."""
@@ -469,6 +477,7 @@ class ContactStep:
             self._allocate(*room)
             self._last_time = last_time
         write_rows(self.problem, rows)
+        self._n_contacts = None
         self._renewal.sides, self._indexed = sides, True  # so that the next step updates the node index
 
     def rows(self, own: bool = False) -> ContactRows:
@@ -521,13 +530,13 @@ class ContactStep:
         """
         paths, self._is_fast = self.paths, False
         known = set() if paths.none_cross else self.found_features()
-        has_left = not self._explicit and paths.left_searched(start.x)  # explicit steps seldom do, and are many
-        passes = not has_left and paths.find()
+        # explicit steps seldom leave what was searched, and are many
+        has_left, passes = (False, paths.find()) if self._explicit else paths.find_unless_left(start.x)
         if has_left or paths.uncovered:
             self.search_way(time, dt, start)
             passes = paths.find(as_searched=True)
         elif passes and self._explicit:
-            paths.left_searched(start.x)  # which keeps the way
+            paths.keep_path(start.x)
         if passes:
             return BLOCKED if paths.is_stuck else MET
         if paths.none_cross or self._explicit:
@@ -554,7 +563,7 @@ class ContactStep:
 
     def search_way(self, time: float, dt: float, start: StepState) -> None:
         """Search the way from a start to the present state, which stays."""
-        self.paths.left_searched(start.x)
+        self.paths.keep_path(start.x)
         end = self.simulation.state()
         self.simulation.now.copy_nodes_from(start)
         self.search_along(time, dt)

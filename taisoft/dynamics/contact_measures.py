@@ -29,7 +29,8 @@ from taisoft.contact.build import obstacle_displacement_at
 from taisoft.fem.state import DEVIATION
 
 MAX_CLOSING = 0.5  # of the thinner side's thickness: how far a contact may close in one step
-DEPTH, CLOSING_RATIO, SPEED, WHICH, RELATIVE_PENETRATION = range(5)  # indices into the result of `measure_closing`
+# indices into the result of `measure_closing`; LEFT: contacts that `drop_uncertain` has left
+DEPTH, CLOSING_RATIO, SPEED, WHICH, RELATIVE_PENETRATION, LEFT = range(6)
 DEEP_PENETRATION = 0.02  # of the finer side's mean surface edge: penetration reported as a problem
 
 
@@ -48,7 +49,7 @@ class ContactMeasures:
 
     def __init__(self, detection: Detection, arena: FieldArena):
         self.detection = detection
-        self._closing = arena.field("closing", ti.f64, 5)  # result of `measure_closing`,
+        self._closing = arena.field("closing", ti.f64, 6)  # result of `measure_closing`,
         self._measured: np.ndarray | None = None  # and a copy of it; None: outdated
         self._dt = 0.0  # [s] of the last search
 
@@ -60,10 +61,12 @@ class ContactMeasures:
     def closing(self) -> np.ndarray:
         """The result of `measure_closing` for the step of the last search."""
         if self._measured is None:
-            detection = self.detection
-            measure_closing(*detection.found, detection.counts.contacts, self._dt, self._closing)
-            self._measured = self._closing.to_numpy()
+            self._measure(self.detection.counts.contacts)
         return self._measured
+
+    def _measure(self, n: int) -> None:
+        measure_closing(*self.detection.found, n, self._dt, self._closing)
+        self._measured = self._closing.to_numpy()
 
     @property
     def closing_ratio(self) -> float:
@@ -74,7 +77,10 @@ class ContactMeasures:
         """Drop the contacts of the last search that may never touch, where the check of paths finds those that would: a plane
         across the nearest features also stops what flies past them."""
         detection = self.detection
-        detection.counts.contacts = drop_uncertain(*detection.found, detection.counts.contacts)
+        drop_uncertain(*detection.found, detection.counts.contacts, self._closing)
+        if not detection.model.on_cpu:  # one reading for both
+            self._measure(-1)
+        detection.counts.contacts = int((self._closing if self._measured is None else self._measured)[LEFT])
 
     def crossing(self) -> Crossing:
         """Measure crossing triangles and contained colliders."""
@@ -125,12 +131,15 @@ def _relative_displacement(s: ti.template(), o: ti.template(), found: ti.templat
 
 
 @kernel
-def drop_uncertain(s: ti.template(), o: ti.template(), found: ti.template(), kept: ti.template(), n: ti.i32) -> ti.i32:
+def drop_uncertain(
+    s: ti.template(), o: ti.template(), found: ti.template(), kept: ti.template(), n: ti.i32, closing_data: ti.template()
+):
     """Leave out of kept[:n] the contacts whose sides close by more than MAX_CLOSING of the thinner one's thickness in the
-    searched step, and move aside by as much before they meet: they may never touch. Passages remain. Return the number left."""
-    left = 0
+    searched step, and move aside by as much before they meet: they may never touch. Passages remain. closing_data: LEFT, the
+    number left."""
     ti.loop_config(serialize=True)
     for _ in range(1):
+        left = 0
         for c in range(n):
             at = kept[c]
             displacement, normal = _relative_displacement(s, o, found, at), found.normal[at]
@@ -143,7 +152,7 @@ def drop_uncertain(s: ti.template(), o: ti.template(), found: ti.template(), kep
             if is_certain:
                 kept[left] = at
                 left += 1
-    return left
+        closing_data[LEFT] = left
 
 
 @kernel
@@ -156,16 +165,16 @@ def measure_closing(
     dt: ti.f64,
     closing_data: ti.template(),
 ):
-    """Measure the contacts' closing in the coming step of dt.
+    """Measure the closing of n contacts in the coming step of dt; n = -1: of those left by `drop_uncertain`.
 
-    closing_data (5,): deepest penetration [m]; largest closing ratio of a contact (see above); its closing speed [m/s]; its
+    closing_data (6,): deepest penetration [m]; largest closing ratio of a contact (see above); its closing speed [m/s]; its
     number among the kept ones; deepest penetration over the finer side's mean surface edge.
     """
     ti.loop_config(serialize=True)
     for _ in range(1):
         depth, largest_ratio, speed, which = ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64), -1
         relative_penetration = ti.cast(0.0, ti.f64)
-        for c in range(n):
+        for c in range(ti.select(n < 0, ti.cast(closing_data[LEFT], ti.i32), n)):
             at = kept[c]
             depth = ti.max(depth, -found.gap[at])
             a, b = found.body[at][0], found.body[at][1]

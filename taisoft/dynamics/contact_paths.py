@@ -71,14 +71,35 @@ class ContactPaths:
 
     def left_searched(self, x_start) -> bool:
         """Return whether the surface left the searched path since x_start; keep its displacement for another search."""
-        model = self._simulation.model
-        find_displacement(model, self._detection.surface, x_start, self.displacement)
-        return bool(model.state.scalars[DEVIATION] > 0.5 * self._detection.margin)
+        self.keep_path(x_start)
+        return self.leaves(self._simulation.model.state.scalars[DEVIATION])
+
+    def leaves(self, deviation: float) -> bool:
+        """Return whether a path so far from the searched one [m] leaves it."""
+        return deviation > 0.5 * self._detection.margin
+
+    def keep_path(self, x_start) -> None:
+        """Keep the displacement since x_start for another search."""
+        find_displacement(self._simulation.model, self._detection.surface, x_start, self.displacement)
+
+    def find_unless_left(self, x_start) -> tuple[bool, bool]:
+        """Return whether the surface left the searched path since x_start, see `left_searched`, and else what `find` returns."""
+        model, paths = self._simulation.model, self._detection.paths
+        if model.on_cpu:
+            has_left = self.left_searched(x_start)
+            return has_left, not has_left and self.find()
+        self.keep_path(x_start)
+        found = self._detection.passages(TO_STATE, [model.state.scalars])  # one reading for both
+        has_left = self.leaves(paths.also[0][DEVIATION])
+        return has_left, not has_left and self._hold_found(self._unless_bent(found, TO_STATE))
 
     def find(self, as_searched: bool = False) -> bool:
         """Find the passages on the paths from the last search to the present state, or on the searched paths, and hold them from
         now on. Return whether there are any, or whether the paths leave what was searched."""
-        found = self._passages(SEARCHED if as_searched else TO_STATE)
+        return self._hold_found(self._passages(SEARCHED if as_searched else TO_STATE))
+
+    def _hold_found(self, found: tuple[np.ndarray, np.ndarray] | None) -> bool:
+        """See `find`."""
         self.uncovered = found is None
         if found is None:
             return True
@@ -88,7 +109,10 @@ class ContactPaths:
 
     def _passages(self, mode: int) -> tuple[np.ndarray, np.ndarray] | None:
         """Return the passages on the paths of a mode, none if a bent path is free, see `collision.bent_path`."""
-        found = self._detection.passages(mode)
+        return self._unless_bent(self._detection.passages(mode), mode)
+
+    def _unless_bent(self, found: tuple[np.ndarray, np.ndarray] | None, mode: int) -> tuple[np.ndarray, np.ndarray] | None:
+        """Return the passages found on the paths of a mode, none if a bent path is free."""
         if found is None or len(found[0]) == 0 or (found[0][:, 0] == FLAT).any():
             return found
         return NO_PASSAGES if self._detection.bends(mode) else found

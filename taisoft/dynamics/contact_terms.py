@@ -14,10 +14,11 @@ import taichi as ti
 
 from taisoft.backend.arrays import FieldArena
 from taisoft.backend.runtime import kernel
-from taisoft.contact.problem import RESIDUAL, ContactProblem, residual_of
+from taisoft.contact.problem import ContactProblem, residual_of
 from taisoft.contact.prox import OPEN, dvec, into_disk, prox, scaled, state_of
 from taisoft.contact.targets import contact_offset_of
 from taisoft.fem.model import Model
+from taisoft.fem.state import HAS_FRICTION, IMPULSE_SQUARE, LAW, WORST_GAP
 from taisoft.linear.block_csr import BLOCK
 from taisoft.linear.coupling import NO_COUPLING, Coupling, build_coupling
 
@@ -72,6 +73,7 @@ NO_CONTACTS = StageContacts(None, None, NO_COUPLING, *[None] * 4)
 
 @kernel
 def begin_contacts(
+    m: ti.template(),
     stage: ti.template(),
     contacts: ti.template(),
     impact: ti.template(),
@@ -83,9 +85,12 @@ def begin_contacts(
     """Set the constant contact data of a stage, in a step of dt [s].
 
     impact: whether the contacts' velocity must be `min_velocity`, regardless of gaps. common_offset: contact offset between
-    different bodies [m]. tolerance: of the laws' residual.
+    different bodies [m]. tolerance: of the laws' residual. scalars: HAS_FRICTION.
     """
     rows, work = ti.static((contacts.problem, contacts.work))
+    ti.loop_config(serialize=True)
+    for _ in range(1):
+        m.state.scalars[HAS_FRICTION] = 0.0
     ti.loop_config(serialize=rows.serial)
     for c in range(rows.count[0]):
         offset = -(beta / dt) * rows.obstacle_displacement[c]
@@ -94,6 +99,8 @@ def begin_contacts(
                 i = rows.node[e]
                 offset += rows.weight[e] * (contacts.x_start[i] - stage.x_hat[i])
         work.tangential_offset[c] = offset
+        if rows.friction[c] != 0.0:
+            m.state.scalars[HAS_FRICTION] = 1.0
         work.rounding[c] = ti.cast(ROUNDING, ti.f64) * ti.abs(rows.point[c]).max() / (beta * tolerance)
         if ti.static(impact):
             work.gap_minus_target[c] = -beta * rows.min_velocity[c] - (beta / dt) * rows.normal[c].dot(
@@ -218,8 +225,8 @@ def impulse_on_node(contacts: ti.template(), i):
 
 
 @ti.func
-def sum_residual(contacts: ti.template(), t):
-    """Compute the residual of the laws over all contacts, by all threads t of the team.
+def sum_residual(m: ti.template(), contacts: ti.template(), t):
+    """Compute the residual of the laws over all contacts, by all threads t of the team. scalars: LAW and the next two.
 
     It is relative to all impulses, so that a light contact beside heavy ones could let its gap close. The largest part of its
     target, or of the contact offset if that is less, by which a gap ends short is therefore a residual, too: MAX_MISSED
@@ -235,15 +242,16 @@ def sum_residual(contacts: ti.template(), t):
         sums[j] = rows.team.total(t, sums[j])
     worst = rows.team.largest(t, worst)
     if t == 0:
-        rows.sweep.state[RESIDUAL] = ti.max(residual_of(sums), worst)
+        m.state.scalars[LAW] = ti.max(residual_of(sums), worst)
+        m.state.scalars[IMPULSE_SQUARE], m.state.scalars[WORST_GAP] = sums[1], worst
 
 
 @ti.func
-def find_residual(contacts: ti.template()):
+def find_residual(m: ti.template(), contacts: ti.template()):
     """`sum_residual` as a top-level loop of a kernel."""
     ti.loop_config(serialize=contacts.problem.team.alone, block_dim=contacts.problem.team.threads)
     for t in range(contacts.problem.team.threads):
-        sum_residual(contacts, t)
+        sum_residual(m, contacts, t)
 
 
 @kernel
@@ -264,7 +272,7 @@ def update_impulses(m: ti.template(), contacts: ti.template(), new_multipliers: 
                 z = dvec(ti.min(z[0], 0.0), 0.0, 0.0)
             contacts.work.multiplier[n] = z
         update_contact(m, contacts, n, beta, r_scale)
-    find_residual(contacts)
+    find_residual(m, contacts)
 
 
 @kernel

@@ -113,11 +113,15 @@ class Friction:
             elif solves >= cls.LEAST_SOLVES and system.budget.is_out_of_time():
                 break
             else:
-                found = system.solve_linear(max(goal.forcing, goal.later if solves else 0.0))
+                tolerance, after = max(goal.forcing, goal.later if solves else 0.0), None
+                if system.by_team:
+                    found, after = system.step_by_team(tolerance, scale)
+                else:
+                    found = system.solve_linear(tolerance)
                 solves, linear, n_steps = solves + 1, linear + found.iterations, n_steps + 1
                 if negative := found.negative:
                     break
-                before, r = r, system.advance(scale)
+                before, r = r, system.advance(scale) if after is None else after
                 rounding = r <= cls.ROUNDING * system.floor and r > 0.5 * before
         system.r_scale = FIRST_R
         if not (converged or negative or system.budget.ran_out):

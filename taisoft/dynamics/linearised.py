@@ -21,9 +21,9 @@ from taisoft.dynamics.contact_terms import (
 )
 from taisoft.dynamics.stage import norm_weight, place_node
 from taisoft.fem.chunks import chunk_entry, chunk_size, fold, total
-from taisoft.fem.state import NORMS, OTHER_SUM, STEP_LENGTH, SUM
+from taisoft.fem.state import LINEAR_COUNT, LINEAR_STATUS, NORMS, OTHER_SUM, STEP_LENGTH, SUM
 from taisoft.linear.block_csr import block_times, off_diagonal_times
-from taisoft.linear.pcg_work import dot64
+from taisoft.linear.pcg_work import COUNT, NEGATIVE, RUNNING, STATUS, dot64
 
 ROOT, TRIES, LONGEST = 0.05, 40, 1e3  # tolerance over the initial slope; maximum trial lengths; longest step length
 
@@ -98,8 +98,11 @@ def _root(contacts: ti.template(), linear_slope, curvature, start, r_scale, t):
 
 
 @ti.func
-def _find_step_length(m: ti.template(), contacts: ti.template(), r_scale, t):
-    """Set STEP_LENGTH, by all threads t of the team, from the sums over the nodes and the contacts' rates."""
+def _find_step_length(m: ti.template(), stage: ti.template(), contacts: ti.template(), r_scale, t):
+    """Set STEP_LENGTH, by all threads t of the team, from the sums over the nodes and the contacts' rates.
+
+    0 unless a team's linear solve has ended without negative curvature: the host has not looked yet.
+    """
     rows, work = ti.static((contacts.problem, contacts.work))
     start = total(m, SUM)
     linear_slope = start
@@ -112,6 +115,11 @@ def _find_step_length(m: ti.template(), contacts: ti.template(), r_scale, t):
     length = _root(contacts, linear_slope, total(m, OTHER_SUM), start, r_scale, t)
     if t == 0:
         m.state.scalars[STEP_LENGTH] = length
+        if ti.static(stage.pcg.by_team):
+            status = stage.pcg.state[STATUS]
+            if status == RUNNING or status == NEGATIVE:
+                m.state.scalars[STEP_LENGTH] = 0.0
+            m.state.scalars[LINEAR_COUNT], m.state.scalars[LINEAR_STATUS] = stage.pcg.state[COUNT], status
 
 
 @ti.func
@@ -156,7 +164,7 @@ def _node_residual(m: ti.template(), stage: ti.template(), contacts: ti.template
 @ti.func
 def _find_residual(m: ti.template(), stage: ti.template(), contacts: ti.template()):
     """Compute the residual, -r as CG's right side, and the first of NORMS, as top-level loops of a kernel."""
-    find_residual(contacts)
+    find_residual(m, contacts)
     ti.loop_config(serialize=m.serial)
     for task in range(m.chunks * m.spread):
         if task % m.spread == 0:
@@ -175,7 +183,7 @@ def _find_residual(m: ti.template(), stage: ti.template(), contacts: ti.template
 def find_step_length(
     m: ti.template(), stage: ti.template(), A: ti.template(), contacts: ti.template(), beta: ti.f64, r_scale: ti.f64
 ):
-    """Find the zero of the slope along y of stage.pcg. scalars: STEP_LENGTH."""
+    """Find the zero of the slope along y of stage.pcg. scalars: STEP_LENGTH, LINEAR_COUNT, LINEAR_STATUS."""
     (rows,) = ti.static((contacts.problem,))
     ti.loop_config(serialize=m.serial)
     for task in range(m.chunks * m.spread):
@@ -194,7 +202,7 @@ def find_step_length(
         _contact_slope(stage, contacts, c, beta)
     ti.loop_config(serialize=rows.team.alone, block_dim=rows.team.threads)
     for t in range(rows.team.threads):
-        _find_step_length(m, contacts, r_scale, t)
+        _find_step_length(m, stage, contacts, r_scale, t)
 
 
 @kernel

@@ -195,22 +195,23 @@ def add_step(
     sums: ti.template(),
     n_rows: ti.i32,
     passes: ti.i32,
-) -> ti.i32:
-    """Add a step of dt [s] to the sums (n_rows,9) of pairs. overlay, found: those of the search at its end; has_pairs: whether
-    contacts may be of two triangles; passes: 1 if the substep found passages.
+):
+    """Add a step of dt [s] to the sums (n_rows + 1, 9) of pairs.
 
-    Return the row of the pair of the largest misplaced part among those that touch, -1 if none does, -2 without change if there
-    are too few rows. p.sweep.sweep_start is used as workspace.
+    overlay, found: those of the search at its end; has_pairs: whether contacts may be of two triangles; passes: 1 if the substep
+    found passages.
+
+    The first number of the last row becomes the row of the pair of the largest misplaced part among those that touch, -1 if none
+    does, -2 without change if there are too few rows. p.sweep.sweep_start is used as workspace.
     """
     ti.loop_config(serialize=p.serial)
     for c in range(p.count[0]):
         p.sweep.sweep_start[c] = dvec(0.0)
         if p.r[c][0] > 0.0:
             p.sweep.sweep_start[c] = _false_work(p, m, s, o, overlay, found, has_pairs, c, dt, contact_offset, passes)
-    worst = -1
     ti.loop_config(serialize=True)
     for _ in range(1):
-        row = 0
+        worst, row = -1, 0
         for k in range(n_rows):
             for q in ti.static(range(4)):
                 sums[k, NOW + q] = 0.0
@@ -238,7 +239,7 @@ def add_step(
                     worst, largest = k, part
         if row == n_rows:
             worst = -2
-    return worst
+        sums[n_rows, 0] = worst
 
 
 class Misplacement:
@@ -249,12 +250,16 @@ class Misplacement:
 
     def __init__(self, simulation: SimulationState, detection: Detection):
         self._simulation, self._detection = simulation, detection
-        self._arena = FieldArena()
-        self._sums = self._arena.field("misplaced", ti.f64, NO_SUMS.shape)  # for kernels
+        self._arena, self._stored = FieldArena(), None  # the latter: the numbers that the next one has
+        self._sums = self._arena.field("misplaced", ti.f64, (len(NO_SUMS) + 1, COLUMNS))  # for kernels; of `add_step`
         self.start_step()
 
     def _store(self, sums: np.ndarray) -> None:
         """Put the sums where kernels find them."""
+        is_there, self._stored = sums is self._stored, None
+        if is_there:
+            return
+        sums = np.append(sums, sums[:1], axis=0)
         if self._sums.shape[0] == len(sums):
             self._sums.from_numpy(sums)
         else:
@@ -275,9 +280,14 @@ class Misplacement:
         last = detection.surface, detection.shapes, detection.overlay, detection.buffer.data, detection.has_pairs
         records = problem, self._simulation.model, *last
         self._store(now.misplaced)
-        while (row := add_step(*records, dt, contact_offset, n, self._sums, self._sums.shape[0], int(passes))) == -2:
-            self._store(np.concatenate([self._sums.to_numpy(), np.resize(NO_SUMS, self._sums.shape)]))
-        now.misplaced = self._sums.to_numpy()
+        while True:
+            add_step(*records, dt, contact_offset, n, self._sums, self._sums.shape[0] - 1, int(passes))
+            *sums, (row, *_) = self._sums.to_numpy()
+            now.misplaced = self._stored = np.array(sums)
+            if row != -2:
+                break
+            self._store(np.concatenate([now.misplaced, np.resize(NO_SUMS, now.misplaced.shape)]))
+        row = int(row)
         if row < 0:
             return
         slip, false, friction, largest, slip_now, false_now, *_, pair = now.misplaced[row].tolist()

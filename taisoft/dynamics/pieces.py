@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 import taichi as ti
 
-from taisoft.backend.arrays import Count, FieldArena, download, upload
+from taisoft.backend.arrays import Count, FieldArena, download
 from taisoft.dynamics.rigid_balance import N_MOMENTS, N_SUMS, N_TERMS, measure_pieces
 from taisoft.dynamics.simulation_state import SimulationState
 from taisoft.dynamics.stage import StageWork
@@ -78,6 +78,7 @@ class Pieces:
         component, piece = component[np.argsort(number)], number[piece]
         self.of_node, self._component = piece, component[piece]
         self._simulation = simulation
+        self.weights, self._is_uploaded = np.ones(n), True  # those of `work`, which lag behind until they are needed
         self._loose_free, self._loose = np.zeros(0), True  # of the last call of `any_loose`
         self._free, self._any_free = np.zeros(0), False  # of the last call of `any_free`
         self._independent = np.ones(n_nodes, dtype=bool)
@@ -128,19 +129,19 @@ class Pieces:
 
     def node_weights(self) -> np.ndarray:
         """Return 1 / s_p of each node's piece (n_nodes,)."""
-        return np.sqrt(self.work.weight.to_numpy())[self.of_node]
+        return np.sqrt(self.weights)[self.of_node]
 
-    def any_free(self, free: np.ndarray) -> bool:
-        """Return whether some component is free along some axis, but for contacts. free: (n_nodes, 3), 0 on constrained axes."""
-        if not np.array_equal(free, self._free):
+    def any_free(self) -> bool:
+        """Return whether some component is free along some axis, but for contacts."""
+        if (free := self._simulation.free) is not self._free:
             held = (free == 0.0) & self._independent[:, None]
             fixed = [np.bincount(self._component, held[:, axis], len(self.anchored)) for axis in range(3)]
-            self._free, self._any_free = free.copy(), bool(((np.array(fixed) == 0.0) & ~self.anchored).any())
+            self._free, self._any_free = free, bool(((np.array(fixed) == 0.0) & ~self.anchored).any())
         return self._any_free
 
-    def any_loose(self, free: np.ndarray) -> bool:
-        """Return whether constraints leave some component a rigid motion, as of a hinge. free: as in `any_free`."""
-        if not np.array_equal(free, self._loose_free):
+    def any_loose(self) -> bool:
+        """Return whether constraints leave some component a rigid motion, as of a hinge."""
+        if (free := self._simulation.free) is not self._loose_free:
             rest = self._simulation.layout.rest
             node, axis = np.nonzero((free == 0.0) & self._independent[:, None])
             along, n = np.eye(3)[axis], len(self.anchored)
@@ -149,7 +150,7 @@ class Pieces:
             number = 36 * self._component[node][:, None] + np.arange(36)
             grams = np.bincount(number.ravel(), (held[:, :, None] * held[:, None]).ravel(), 36 * n).reshape(n, 6, 6)
             least, *_, largest = np.linalg.eigvalsh(grams).T
-            self._loose_free, self._loose = free.copy(), bool((least <= RIGID * largest).any())
+            self._loose_free, self._loose = free, bool((least <= RIGID * largest).any())
         return self._loose
 
     def _sums(self, values: np.ndarray) -> np.ndarray:
@@ -184,11 +185,19 @@ class Pieces:
 
     def forget_weights(self) -> None:
         """Let all pieces count alike, and linear solves without factors."""
-        upload([(self.work.weight, np.ones(self.work.n)), (self.work.factor, np.ones(self.work.n_components))])
+        self.weights, self._is_uploaded = np.ones(self.work.n), True
+        self.work.weight.fill(1.0)
+        self.forget_factors()
+
+    def upload_weights(self) -> None:
+        """Upload the weights if they have changed."""
+        if not self._is_uploaded:
+            self.work.weight.from_numpy(self.weights)
+            self._is_uploaded = True
 
     def forget_factors(self) -> None:
         """Let all components count alike in slopes."""
-        upload([(self.work.factor, np.ones(self.work.n_components))])
+        self.work.factor.fill(1.0)
 
     def momenta(self, mass: np.ndarray, v: np.ndarray) -> np.ndarray:
         """Return the norm (n,) of the momenta of each piece's nodes [N s]. mass: (n_nodes,), v: (n_nodes, 3)."""
@@ -213,18 +222,18 @@ class Pieces:
         k = int(np.argmax(ratio))
         return float(ratio[k]), self._names[k]
 
-    def weigh(self, floor: np.ndarray, beta: float, tolerance: float, static: bool) -> tuple[float, str]:
-        """Set the weights from `norms`; return the largest |r|_p over s_p, and the name of that piece.
+    def weigh(self, norms: np.ndarray, floor: np.ndarray, beta: float, tolerance: float, static: bool) -> tuple[float, str]:
+        """Set the weights from norms (N_SUMS, n); return the largest |r|_p over s_p, and the name of that piece.
 
         floor (n,): |r|_p that is rounding [N s].
         """
-        r, inertia, internal, loads, held = np.sqrt(self.work.norms.to_numpy()).T
+        r, inertia, internal, loads, held = norms
         scale = inertia + beta * (internal + loads)
         if static:
             scale = np.where(loads > 0.0, beta * loads, np.where(held > 0.0, held, beta * internal))
         least = np.maximum(scale, floor / tolerance)
         least = np.where(least > 0.0, least, max(float(least.max()), np.finfo(np.float64).tiny))
-        upload([(self.work.weight, 1.0 / least**2)])
+        self.weights, self._is_uploaded = 1.0 / least**2, False
         ratio = r / least
         worst = int(np.argmax(ratio))
         return float(ratio[worst]), self._names[worst]

@@ -28,13 +28,14 @@ class Renewal:
         self._seen = arena.vectors("seen_displacement", ti.f64, model.n_nodes)  # at the last look [m]
         self.sides: tuple[np.ndarray, np.ndarray] | None = None
         self.n_looks = 0  # in this stage
-        self._found: EndSearch | None = None  # by the last look
+        self._found: EndSearch | None = None  # by the last look,
+        self.n_contacts = self.n_entries = 0  # and those of the problem then, and their entries
 
     def look(self, problem: ContactProblem, time: float, dt: float, x_start: Any, displacement: Any, offset: float) -> int:
         """Find the contacts at displacements from x_start, (n_nodes) 3-vectors f64 [m] each, in a substep of dt from a time [s].
 
         offset [m]: contact offset. Return the number of contacts that `problem` needs room for if these are to be adopted; 0 if
-        nothing changes.
+        nothing changes. Sets `n_contacts` and `n_entries`.
         """
         if self.n_looks == self.MAX_LOOKS:
             return 0
@@ -43,10 +44,12 @@ class Renewal:
             return 0
         self.n_looks += 1
         copy_values(self._model, self._seen, displacement)
-        self._found = end = self._detection.find_at_end(time, dt, x_start, displacement, self.TRUSTED * self._detection.edge)
+        farthest = self.TRUSTED * self._detection.edge
+        self._found = end = self._detection.find_at_end(time, dt, x_start, displacement, farthest, [problem.count])
         if end is None:
             return 0
-        return end.reduction.n_kept + int(problem.count[0])
+        self.n_contacts, _, self.n_entries = end.also[0]
+        return end.reduction.n_kept + self.n_contacts
 
     def adopt(
         self, problem: ContactProblem, numbers: PairNumbers, dt: float, x_start: Any, displacement: Any, offset: float
@@ -58,7 +61,7 @@ class Renewal:
         model, detection, end = self._model, self._detection, self._found
         s, shapes, (surface, found, kept, n) = detection.surface, detection.shapes, end.found
         if model.has_dependents and n:
-            n = drop_vanishing(problem, model, s, found, kept, n, problem.count[0], problem.count[2])
+            n = drop_vanishing(problem, model, s, found, kept, n, self.n_contacts, self.n_entries)
         lengths = dt, offset, detection.margin, detection.floor
         if not judge(problem, s, surface, shapes, x_start, displacement, found, kept, n, *lengths):
             return False

@@ -48,6 +48,7 @@ class SimulationState:
     budget: float | None = None  # wall time of an implicit step in time [s]
     asleep: np.ndarray | None = None  # (n_nodes,) bool: of bodies that sleep, see `sleeping`; None: none ever does
     at: float | None = None  # [s] when all that follows paths has the values towards which it grows, too; None: it follows them
+    free: np.ndarray | None = None  # (n_nodes, 3) 1 on free axes, as uploaded last
     _loads: SceneLoads | None = None  # None: not computed, or outdated
     load_time: float | None = None  # of the loads on the device; None: several, or outdated
     _start: list[np.ndarray] | None = None  # free axes, positions and velocities at the start
@@ -141,6 +142,7 @@ class SimulationState:
         arrays = (m.free, m.state.x, m.state.v)
         if self._start is not None:
             upload(list(zip(arrays, self._start)))
+            self.free = self._start[0]
         else:
             self.upload_constraints()
             self.set_state(self.layout.rest, self._rest_velocities())
@@ -183,6 +185,7 @@ class SimulationState:
             free[self.dependents.node] = False
         if self.asleep is not None:
             free[self.asleep] = False
+        self.free = free.astype(np.float64)
         upload([(self.model.free, free)])
 
     def upload_gravity(self) -> None:

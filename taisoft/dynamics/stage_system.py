@@ -16,7 +16,7 @@ import taichi as ti
 
 from taisoft.backend.arrays import FieldArena, download, upload
 from taisoft.backend.blas import one_thread
-from taisoft.contact.problem import RESIDUAL, find_factors
+from taisoft.contact.problem import find_factors
 from taisoft.dynamics import rigid_balance
 from taisoft.dynamics.contact_terms import (
     KEEP,
@@ -66,11 +66,23 @@ from taisoft.dynamics.stage import (
     set_direction_to_rest,
 )
 from taisoft.fem.dependents import place_dependents
-from taisoft.fem.state import END_SLOPE, N_NORMS, NORMS, START_SLOPE
+from taisoft.fem.state import (
+    END_SLOPE,
+    HAS_FRICTION,
+    IMPULSE_SQUARE,
+    LAW,
+    LINEAR_COUNT,
+    LINEAR_STATUS,
+    N_NORMS,
+    N_SCALARS,
+    NORMS,
+    START_SLOPE,
+    WORST_GAP,
+)
 from taisoft.linear import block_csr, gauss_seidel, pcg
 from taisoft.linear.block_csr import BlockCsr
 from taisoft.linear.jacobi import JACOBI
-from taisoft.linear.pcg_work import LinearResult, build_pcg
+from taisoft.linear.pcg_work import LinearResult, build_pcg, result_of
 from taisoft.linear.sweep_order import find_last
 from taisoft.linear.volumes import VolumeSystem, restore_volumes, save_volumes, step_with_volumes
 
@@ -128,7 +140,7 @@ class StageSystem:
         self.kind = self._nonlinear_kind = ELASTIC_STAGE  # the latter without LINEARISED
         self.scale = 0.0  # that |r| is relative to, at its last evaluation
         self.r_scale = 1.0  # R over the r-factors
-        self.frictionless = False  # whether no contact of the stage has friction
+        self._status = np.zeros(N_SCALARS)  # the scalars of the model's state as they were last read
         self._rejects_direct = False  # whether a direct solve of this stage was rejected: others would be, too
         self.n_direct = 0  # frictional problems in a row that were solved directly
         self._contact_arena = FieldArena()
@@ -188,7 +200,7 @@ class StageSystem:
     @property
     def n_contacts(self) -> int:
         """Contacts of the present stage."""
-        return int(self.contacts.problem.count[0]) if self.contacts.any else 0
+        return self.step_contacts.n_contacts if self.contacts.any else 0
 
     @property
     def is_static(self) -> bool:
@@ -198,27 +210,30 @@ class StageSystem:
     @property
     def is_balanced(self) -> bool:
         """Whether |r| was within the stage's tolerance at its last evaluation."""
-        return math.sqrt(self.model.state.scalars[NORMS]) <= self.stage.tolerance * self.scale
+        return math.sqrt(self._status[NORMS]) <= self.stage.tolerance * self.scale
 
     @property
     def contact_residual(self) -> float:
         """Residual of the contact laws at the last evaluation."""
-        return float(self.contacts.problem.sweep.state[RESIDUAL]) if self.contacts.any else 0.0
+        return float(self._status[LAW]) if self.contacts.any else 0.0
+
+    @property
+    def frictionless(self) -> bool:
+        """Whether no contact of the stage has friction."""
+        return self._status[HAS_FRICTION] == 0.0
 
     def impulses_are_rounding(self) -> bool:
         """Return whether impulses are below the rounding of the momenta of the bodies, and gaps hold: bodies that drift together
         barely touch."""
         mass, v = download([self.model.mass, self.work.v_hat])
         least = self.rounding.eps * self.pieces.momenta(mass.astype(np.float64), v).min()
-        _, square, gap = self.contacts.work.prox_residual.to_numpy()[: int(self.contacts.problem.count[0])].T
-        return bool(square.sum() <= least**2 and gap.max(initial=0.0) <= self.stage.contact_tolerance)
+        return bool(self._status[IMPULSE_SQUARE] <= least**2 and self._status[WORST_GAP] <= self.stage.contact_tolerance)
 
     @property
     def slopes(self) -> tuple[float, float]:
         """(r.y at the start of the step, r.y at its end); negative: descent."""
-        scalars = self.model.state.scalars
-        start = scalars[START_SLOPE] + (self.multipliers.slope_change if self.multipliers is not None else 0.0)
-        return start, scalars[END_SLOPE]
+        start = float(self._status[START_SLOPE]) + (self.multipliers.slope_change if self.multipliers is not None else 0.0)
+        return start, float(self._status[END_SLOPE])
 
     @property
     def multipliers_hold(self) -> bool:
@@ -290,11 +305,9 @@ class StageSystem:
         """Begin the contacts of the step in the present stage."""
         self._allocate_contacts()
         self.contacts, stage = self._storage, self.stage
-        n, offset = self.n_contacts, self.step_contacts.contact_offset
-        self._may_share = NODES_PER_CONTACT * n <= self.model.n_nodes
-        impact = self.kind == IMPACT
-        begin_contacts(self.work, self.contacts, impact, stage.beta, stage.dt, offset, stage.contact_tolerance)
-        self.frictionless = not download([self.contacts.problem.friction], n)[0].any()
+        impact, offset = self.kind == IMPACT, self.step_contacts.contact_offset
+        self._may_share = self.model.on_cpu and NODES_PER_CONTACT * self.n_contacts <= self.model.n_nodes
+        begin_contacts(self.model, self.work, self.contacts, impact, stage.beta, stage.dt, offset, stage.contact_tolerance)
         if self.work.pcg.has_last(self.contacts.coupling):
             find_last(self.model, self.matrix, self.contacts.coupling, self.work.pcg)
 
@@ -309,12 +322,12 @@ class StageSystem:
         changed = self.step_contacts.renew(self.x_start, self.contacts.displacement)
         if self.stage.linearised:
             return_to_base(self.model, self.work)
-        before = self.contacts
-        if not changed and self.step_contacts.problem is before.problem:
+        before, grows = self.contacts, self.step_contacts.problem is not self.contacts.problem
+        if not (changed or grows):
             return False
-        base = before.coupling.base.to_numpy()
+        base = before.coupling.base.to_numpy() if grows else None
         self.begin_contacts()
-        if self.contacts is not before:  # the storage has grown: set the displacements there, and the diagonal
+        if grows:  # set the displacements in the new storage, and the diagonal
             upload([(self.contacts.coupling.base, base)])
             move(self.model, self.work, self.contacts, self.kind, STAY, 1.0, self.stage.c, self.stage.beta)
         self._same_matrix = False  # its rows are, but not those of the contacts' terms
@@ -326,30 +339,40 @@ class StageSystem:
 
         new_multipliers: see `update_impulses`.
         """
+        self._evaluate(mode, step_length, new_multipliers)
+        return self._norm_and_scale(self.stage.c, self.stage.beta)
+
+    def _evaluate(self, mode: int | None, step_length: float, new_multipliers: int) -> None:
         m, w, k, stage = self.model, self.work, self.contacts, self.stage
         if mode is not None:
             move(m, w, k, self.kind, mode, step_length, stage.c, stage.beta)
             if self.multipliers is not None:
                 self.multipliers.measure()
+        self.pieces.upload_weights()
         if k.any:
             update_impulses(m, k, new_multipliers, stage.beta, self.r_scale)
         form_residual(m, w, self.matrix, k, self.kind, stage.beta)
-        return self._norm_and_scale(stage.c, stage.beta)
 
     def evaluate_start(self) -> tuple[float, float]:
         """Return (|r|, scale) of the first iterate, with its weights of pieces."""
-        found = self.evaluate(new_multipliers=TO_IMPULSES)
-        if not (self.pieces.several and math.isfinite(found[0]) and self.kind == ELASTIC_STAGE):
-            return found
-        self._weigh()
-        return self.evaluate(None)
+        self._evaluate(STAY, 1.0, TO_IMPULSES)
+        if self.pieces.several and self.kind == ELASTIC_STAGE and self._weigh(only_finite=True):
+            self._evaluate(None, 1.0, KEEP)
+        return self._norm_and_scale(self.stage.c, self.stage.beta)
 
-    def _weigh(self) -> None:
-        """Set the weights of pieces and the rounding floor, and find the least balanced piece."""
+    def _weigh(self, only_finite: bool = False) -> bool:
+        """Set the weights of pieces and the rounding floor, and find the least balanced piece; return whether that was done.
+
+        only_finite: not if |r| is not finite.
+        """
         stage, floor = self.stage, self.rounding.of_pieces(self.stage.c, self.stage.beta)
         measure_pieces(self.model, self.work, self.pieces.work, stage.beta)
-        self.unbalanced = self.pieces.weigh(floor, stage.beta, stage.tolerance, self.is_static and self.step_contacts.idle)
-        self.floor = math.sqrt((floor**2 * self.pieces.work.weight.to_numpy()).sum())
+        norms = np.sqrt(self.pieces.work.norms.to_numpy()).T
+        if only_finite and not np.isfinite(norms[0]).all():
+            return False
+        self.unbalanced = self.pieces.weigh(norms, floor, stage.beta, stage.tolerance, self.is_static and self.step_contacts.idle)
+        self.floor = math.sqrt((floor**2 * self.pieces.weights).sum())
+        return True
 
     def balances_pieces(self) -> bool:
         """Return whether each piece has converged, once |r| has; otherwise its weights are new, and so are |r| and scale."""
@@ -366,21 +389,18 @@ class StageSystem:
     def balance_rigid_motion(self) -> None:
         """Balance free components as a whole, see `pieces`; the elastic forces are those at the end, or of the linearisation."""
         stage, m, w = self.stage, self.model, self.work
-        if stage.c == 0.0 or not self._any_free():
+        if stage.c == 0.0 or not self.pieces.any_free():
             return
         x = self.contacts.x_linear if stage.linearised else m.state.x
         correct_rigid_motion(
             m, w, self.pieces.work, self.contacts, x, rigid_balance.LINEARISED if stage.linearised else SOLVED, stage.beta
         )
 
-    def _any_free(self) -> bool:
-        return self.pieces.any_free(self.model.free.host if self.model.on_cpu else self.model.free.to_numpy())
-
     def begin_linearised_step(self) -> tuple[float, float]:
         """Begin a linearised step without contacts by the rigid motion of its free components; return (|r|, scale)."""
         m, w, p, beta = self.model, self.work, self.pieces.work, self.stage.beta
         found = self.evaluate_start()
-        if not self._any_free():
+        if not self.pieces.any_free():
             return found
         correct_rigid_motion(m, w, p, NO_CONTACTS, m.state.x, BEFORE, beta)
         found = self.evaluate(None)
@@ -390,7 +410,7 @@ class StageSystem:
     def take_linearised_step(self) -> tuple[float, float]:
         """Take the whole step along y; return (|r|, scale)."""
         m, w = self.model, self.work
-        if not self._any_free():
+        if not self.pieces.any_free():
             return self.evaluate(STEP)
         correct_rigid_motion(m, w, self.pieces.work, NO_CONTACTS, m.state.x, AFTER, self.stage.beta)
         return self.evaluate(STAY)
@@ -429,13 +449,32 @@ class StageSystem:
         self.r_scale = r_scale
         find_step_length(self.model, self.work, self.matrix, self.contacts, self.stage.beta, r_scale)
         advance(self.model, self.work, self.contacts, self.stage.beta, r_scale)
-        return math.sqrt(self.model.state.scalars[NORMS])
+        return math.sqrt(self._read()[NORMS])
+
+    @property
+    def by_team(self) -> bool:
+        """Whether a team does the linear solves."""
+        return self.work.pcg.by_team
+
+    def step_by_team(self, tolerance: float, r_scale: float) -> tuple[LinearResult, float]:
+        """`solve_linear`, then `advance` unless there is negative curvature; return the former's result, and |r|.
+
+        One reading tells whether the solve has ended and where it led.
+        """
+        most, found, begins = pcg.iteration_limit(self.model), None, 1
+        while found is None:
+            arguments = self.contacts.coupling, self.work.pcg, tolerance, int(self._same_matrix), begins, most
+            pcg.run_team(self.model, self.matrix, JACOBI, *arguments)
+            r, begins = self.advance(r_scale), 0
+            found = result_of(int(self._status[LINEAR_COUNT]), int(self._status[LINEAR_STATUS]), most)
+        self._same_matrix = True
+        return found, r
 
     def update_multipliers(self, r_scale: float, to_impulses: bool) -> float:
         """Set R over the r-factors of a linearised stage, and the multipliers to the impulses if `to_impulses`; return |r|."""
         self.r_scale = r_scale
         update_multipliers(self.model, self.work, self.contacts, int(to_impulses), self.stage.beta, r_scale)
-        return math.sqrt(self.model.state.scalars[NORMS])
+        return math.sqrt(self._read()[NORMS])
 
     @property
     def patience(self) -> float:
@@ -489,13 +528,18 @@ class StageSystem:
 
     def _norm_and_scale(self, c: float, beta: float) -> tuple[float, float]:
         """Return (|r|, scale) from the norms of `form_residual`."""
-        norms = self.model.state.scalars.to_numpy()[NORMS : NORMS + N_NORMS]
+        norms = self._read()[NORMS : NORMS + N_NORMS]
         r, inertia, elastic, external, held = (math.sqrt(square) for square in norms)
         if c == 0.0 and not self._presses():
             self.scale = beta * external if external > 0.0 else held
         else:
             self.scale = inertia + beta * (elastic + external)
         return r, self.scale
+
+    def _read(self) -> np.ndarray:
+        """Read the scalars that kernels have left."""
+        self._status = self.model.state.scalars.to_numpy()
+        return self._status
 
     def _presses(self) -> bool:
         """Whether any contact of the stage has an impulse."""
@@ -523,7 +567,7 @@ class StageSystem:
     @property
     def is_loose(self) -> bool:
         """Whether constraints leave some component a rigid motion."""
-        return self.pieces.any_loose(self.model.free.to_numpy())
+        return self.pieces.any_loose()
 
     def form(self, projected: bool, c: float, beta: float) -> None:
         """Form the matrix of c and beta at the present positions."""
@@ -556,6 +600,7 @@ class StageSystem:
         m, work, pieces = self.model, self.work.pcg, self.pieces
         if not self.contacts.any:
             if pieces.several:
+                pieces.upload_weights()
                 equalise(m, self.matrix, work, pieces.work, (self.NEARLY * self.stage.tolerance) ** 2)
             solution = self.linear_solver.solve(self.stage, tolerance)
             if pieces.several:

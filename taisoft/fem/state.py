@@ -16,7 +16,10 @@ START_SLOPE, END_SLOPE, STEP_LENGTH = range(12, 15)
 NORMS, N_NORMS = 15, 5  # of a residual, see `form_residual`; in `State.partial` the first columns
 # Of an impact: E'(0) minus the recoverable energy, E''; of a path: largest distance of a vertex from the searched one [m]
 IMPACT_SLOPE, IMPACT_CURVATURE, DEVIATION = range(20, 23)
-N_SCALARS = 23
+# Of the contacts of a stage: residual of their laws, squared norm of their impulses, largest residual of a gap, 1 if any has
+# friction; iterations and status of the last linear solve for them
+LAW, IMPULSE_SQUARE, WORST_GAP, HAS_FRICTION, LINEAR_COUNT, LINEAR_STATUS = range(23, 29)
+N_SCALARS = 29
 
 GO, EVENT = 0, 1  # indices into the state of a batch of sub-steps, see `Surface.run`
 SUM, OTHER_SUM, N_COLUMNS = 5, 6, 8  # further columns; `measure` uses the columns of its scalars

@@ -85,12 +85,13 @@ def solve(
 ) -> LinearResult:
     """Solve for work.y given work.rhs. tolerance: of sqrt(r.z); terms, same_matrix: see `gauss_seidel.solve`."""
 
-    if work.team is not None and preconditioner is JACOBI and not border.any:
-        run_team(model, A, preconditioner, terms, work, tolerance, int(same_matrix), 1, max_iterations)
+    left, by_team = max_iterations, work.by_team and preconditioner is JACOBI and not border.any
+    given = model, A, preconditioner, terms, work, tolerance, int(same_matrix)
+    if by_team:
+        run_team(*given, 1, max_iterations)
         while (result := work.result(max_iterations)) is None:
-            run_team(model, A, preconditioner, terms, work, tolerance, int(same_matrix), 0, max_iterations)
+            run_team(*given, 0, max_iterations)
         return result
-    left = max_iterations
     start(model, A, preconditioner, terms, work, tolerance, int(same_matrix))
     while (result := work.result(max_iterations)) is None:
         n = 1 if model.on_cpu else min(BATCH, left)
@@ -119,7 +120,9 @@ def start(
         if task % model.spread == 0:
             c, n = task // model.spread, model.n_nodes
             for at in range(chunk_size(model, c, n)):
-                _begin_node(model, A, preconditioner, terms, work, chunk_entry(model, c, at, n), same_matrix)
+                i = chunk_entry(model, c, at, n)
+                preconditioner.prepare(model, A, terms, work, i, same_matrix)
+                _clear_node(model, work, i)
     preconditioner.apply(model, work)
     fold(model, OTHER_SUM, OTHER_SUM, ())
     ti.loop_config(serialize=True)
@@ -199,17 +202,8 @@ def _turn(model: ti.template(), work: ti.template()):
 
 
 @ti.func
-def _begin_node(
-    model: ti.template(),
-    A: ti.template(),
-    preconditioner: ti.template(),
-    terms: ti.template(),
-    work: ti.template(),
-    i,
-    same_matrix,
-):
-    """Prepare node i, at y = 0 with r = rhs and p = 0."""
-    preconditioner.prepare(model, A, terms, work, i, same_matrix)
+def _clear_node(model: ti.template(), work: ti.template(), i):
+    """y, r and p of node i at the start."""
     work.r[i] = model.free[i] * work.rhs[i]
     work.y[i], work.p[i] = ti.Vector.zero(model.real, 3), ti.Vector.zero(model.real, 3)
 
@@ -262,75 +256,46 @@ def run_team(
 ):
     """Begin a solve, or go on with it (begins = 0), by TEAM_BATCH iterations at most; FAILED after max_iterations in all.
 
-    preconditioner: one that needs only a node at a time.
+    preconditioner: one that needs only a node at a time. All threads compute the same state; the first one stores it.
     """
     ti.loop_config(serialize=work.team.alone, block_dim=work.team.threads)
     for t in range(work.team.threads):
+        n, s = model.n_nodes, ti.cast(0.0, ti.f64)
         if begins == 1:
-            _begin_by_team(model, A, preconditioner, terms, work, tolerance, same_matrix, t)
-        _iterate_by_team(model, A, preconditioner, terms, work, tolerance, max_iterations, t)
-
-
-@ti.func
-def _begin_by_team(
-    model: ti.template(),
-    A: ti.template(),
-    preconditioner: ti.template(),
-    terms: ti.template(),
-    work: ti.template(),
-    tolerance,
-    same_matrix,
-    t,
-):
-    """As `start`."""
-    rz = ti.cast(0.0, ti.f64)
-    for j in range(work.team.share(t, model.n_nodes)):
-        i = work.team.entry(t, j, model.n_nodes)
-        _begin_node(model, A, preconditioner, terms, work, i, same_matrix)
-        rz += preconditioner.apply_at(work, i)
-        _turn_node(work, i, ti.cast(0.0, model.real))
-    total_rz = work.team.total(t, rz)
-    if t == 0:
-        begin_with(work, tolerance, total_rz)
-    work.team.sync()
-
-
-@ti.func
-def _iterate_by_team(
-    model: ti.template(),
-    A: ti.template(),
-    preconditioner: ti.template(),
-    terms: ti.template(),
-    work: ti.template(),
-    tolerance,
-    max_iterations,
-    t,
-):
-    """As `iterate`, many times: all threads compute the same state, and the first one stores it at the end."""
-    n, rz, status, count = model.n_nodes, work.state[RZ], ti.cast(work.state[STATUS], ti.i32), ti.cast(work.state[COUNT], ti.i32)
-    last = ti.min(count + TEAM_BATCH, max_iterations)
-    while status == RUNNING and count < last:
-        if ti.static(terms.any):
-            for j in range(work.team.share(t, terms.count[0])):
-                form_product(model, terms, work.team.entry(t, j, terms.count[0]), work.p)
-            work.team.sync()
-        s = ti.cast(0.0, ti.f64)
-        for j in range(work.team.share(t, n)):
-            s += _multiply_node(model, A, terms, NO_BORDER, work, 0, work.team.entry(t, j, n))
-        pending, step = step_along(rz, work.team.total(t, s))
-        s = 0.0
-        for j in range(work.team.share(t, n)):
-            i = work.team.entry(t, j, n)
-            _move_node(work, i, ti.cast(step, model.real))
-            s += preconditioner.apply_at(work, i)
-        if pending == RUNNING:
-            before, rz = rz, work.team.total(t, s)
-            status, count = status_at(tolerance, rz, work.state[RZ_START]), count + 1
             for j in range(work.team.share(t, n)):
-                _turn_node(work, work.team.entry(t, j, n), ti.cast(rz / before, model.real))
+                i = work.team.entry(t, j, n)
+                preconditioner.prepare(model, A, terms, work, i, same_matrix)
+                _clear_node(model, work, i)
+                s += preconditioner.apply_at(work, i)
+                _turn_node(work, i, ti.cast(0.0, model.real))
+            start = work.team.total(t, s)
+            if t == 0:
+                begin_with(work, tolerance, start)
             work.team.sync()
-        else:
-            status = NEGATIVE
-    if t == 0:
-        work.state[RZ], work.state[COUNT] = rz, count
-        work.state[STATUS] = ti.select(status == RUNNING and count >= max_iterations, FAILED, status)
+        rz, status, count = work.state[RZ], ti.cast(work.state[STATUS], ti.i32), ti.cast(work.state[COUNT], ti.i32)
+        last = ti.min(count + TEAM_BATCH, max_iterations)
+        while status == RUNNING and count < last:
+            if ti.static(terms.any):
+                for j in range(work.team.share(t, terms.count[0])):
+                    form_product(model, terms, work.team.entry(t, j, terms.count[0]), work.p)
+                work.team.sync()
+            s = 0.0
+            for j in range(work.team.share(t, n)):
+                s += _multiply_node(model, A, terms, NO_BORDER, work, 0, work.team.entry(t, j, n))
+            pending, step = step_along(rz, work.team.total(t, s))
+            s = 0.0
+            for j in range(work.team.share(t, n)):
+                i = work.team.entry(t, j, n)
+                _move_node(work, i, ti.cast(step, model.real))
+                s += preconditioner.apply_at(work, i)
+            before, rz = rz, work.team.total(t, s)
+            if pending == RUNNING:
+                status, count = status_at(tolerance, rz, work.state[RZ_START]), count + 1
+                for j in range(work.team.share(t, n)):
+                    _turn_node(work, work.team.entry(t, j, n), ti.cast(rz / before, model.real))
+            else:
+                status = NEGATIVE
+            work.team.sync()
+        if t == 0:
+            work.state[RZ], work.state[COUNT] = rz, count
+            work.state[STATUS] = ti.select(status == RUNNING and count >= max_iterations, FAILED, status)

@@ -45,13 +45,15 @@ class PcgWork:
     chunk_shift: Count = WHOLE  # a chunk has 2^chunk_shift nodes
     divided: bool = False  # whether the half-rows of matrices are those of a divided sweep
 
+    @property
+    def by_team(self) -> bool:
+        """Whether a team solves."""
+        return self.team is not None
+
     def result(self, max_iterations: int) -> "LinearResult | None":
         """The outcome of a solve; None if it must go on."""
         state = self.state.to_numpy()
-        count, status = int(state[COUNT]), int(state[STATUS])
-        if status == RUNNING and count < max_iterations:
-            return None
-        return LinearResult(count, status == CONVERGED, status in (NEGATIVE, NEGATIVE_PENDING))
+        return result_of(int(state[COUNT]), int(state[STATUS]), max_iterations)
 
     def is_shared(self, coupling: Coupling) -> bool:
         """Whether several threads may share the chunks of one parity."""
@@ -70,6 +72,13 @@ class LinearResult:
     converged: bool
     negative: bool  # whether negative curvature was found
     multigrid: bool = False  # whether multigrid was the preconditioner
+
+
+def result_of(count: int, status: int, max_iterations: int) -> LinearResult | None:
+    """The outcome of a solve after so many iterations with a status; None if it must go on."""
+    if status == RUNNING and count < max_iterations:
+        return None
+    return LinearResult(count, status == CONVERGED, status in (NEGATIVE, NEGATIVE_PENDING))
 
 
 def build_pcg(model: Model, arena: FieldArena) -> PcgWork:

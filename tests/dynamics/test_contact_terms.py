@@ -15,7 +15,7 @@ import pytest
 import taichi as ti
 
 import taisoft as ts
-from taisoft.contact.problem import RESIDUAL, build_node_problem, fill_field, fill_rows, find_factors, index_nodes
+from taisoft.contact.problem import build_node_problem, fill_field, fill_rows, find_factors, index_nodes
 from taisoft.contact.targets import set_targets
 from taisoft.dynamics import contact_terms, linearised
 from taisoft.dynamics.contact_terms import NO_CONTACTS
@@ -25,7 +25,7 @@ from taisoft.dynamics.no_contacts import NoContacts
 from taisoft.dynamics.simulation_state import SimulationState
 from taisoft.dynamics.stage import AGAIN, ELASTIC_STAGE, STAY, STEP, form_residual, move
 from taisoft.dynamics.stage_system import StageSystem
-from taisoft.fem.state import END_SLOPE, N_NORMS, NORMS, START_SLOPE, STEP_LENGTH
+from taisoft.fem.state import END_SLOPE, LAW, N_NORMS, NORMS, START_SLOPE, STEP_LENGTH
 from taisoft.linear import block_csr, gauss_seidel
 from taisoft.linear.block_csr import to_bsr, unpacked
 from tests.contact import contact_oracle as oracle
@@ -77,7 +77,7 @@ def rig():
         k.x_start.from_numpy(start)
         solver.work.x_hat.from_numpy(x_hat)
         set_targets(p, DT, *GAP_TARGETS)
-        contact_terms.begin_contacts(solver.work, k, False, BETA, DT, GAP_TARGETS[0], TOLERANCE)
+        contact_terms.begin_contacts(solver.model, solver.work, k, False, BETA, DT, GAP_TARGETS[0], TOLERANCE)
         J = found.jacobian
         W = J @ np.diag(free.ravel() / np.diag(A)) @ J.T
         rig = SimpleNamespace(m=m, p=p, k=k, solver=solver, work=solver.work, A=A, J=J, W=W, free=free)
@@ -155,7 +155,7 @@ def test_impulses_and_residual_of_the_contact_laws(rig, pressed):
     assert np.abs(r - expected).max() < 1e-11 * np.abs(expected).max()
     fixed_point = np.array([oracle.project(row, mu) for row, mu in zip(r - oracle.factors(rig.W) * u, rig.friction)])
     residual = np.linalg.norm(r - fixed_point) / np.linalg.norm(r)
-    assert rig.p.sweep.state[RESIDUAL] == pytest.approx(residual, rel=1e-11) and residual > 0.01
+    assert rig.m.state.scalars[LAW] == pytest.approx(residual, rel=1e-11) and residual > 0.01
 
 
 def test_a_gap_that_misses_its_target_is_a_residual(rig, pressed):
@@ -167,7 +167,7 @@ def test_a_gap_that_misses_its_target_is_a_residual(rig, pressed):
     rig.k.work.gap_weight.from_numpy(weights * (1e3 / TOLERANCE))
     impulses_at(rig, rig.x)
     rig.k.work.gap_weight.from_numpy(weights)
-    assert rig.p.sweep.state[RESIDUAL] == pytest.approx(1e3 * (-BETA * u[:, 0] / (0.5 * kept))[target > 0].max(), rel=1e-6)
+    assert rig.m.state.scalars[LAW] == pytest.approx(1e3 * (-BETA * u[:, 0] / (0.5 * kept))[target > 0].max(), rel=1e-6)
 
 
 def test_blocks_are_minus_the_derivative_of_the_impulses(rig, pressed):

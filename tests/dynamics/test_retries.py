@@ -152,8 +152,7 @@ def test_where_surfaces_cross_a_part_that_leads_deeper_is_halved(sim, monkeypatc
 def test_where_surfaces_cross_unknown_contacts_are_met(sim, monkeypatch):
     """And a way that closes too fast even in the shortest part is refused."""
     monkeypatch.setattr(ContactPaths, "none_cross", property(lambda self: False))
-    left = ContactPaths.left_searched
-    monkeypatch.setattr(ContactPaths, "left_searched", lambda self, x_start: left(self, x_start) or True)
+    monkeypatch.setattr(ContactPaths, "leaves", lambda self, deviation: True)
     features, found = ContactStep.found_features, []
 
     def unknown_at_first(contact):

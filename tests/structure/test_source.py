@@ -38,7 +38,7 @@ ORDER = (
     ("backend.launching", "backend.paths"),
     ("backend.counters",),
     ("backend.runtime",),
-    ("backend.parallel", "backend.lists", "backend.team"),
+    ("backend.parallel", "backend.lists", "backend.team", "backend.reader"),
     ("scene.checks",),
     ("mesh", "scene"),
     ("fem.state", "fem.math3", "fem.chunks", "fem.spring_table", "fem.dependent_table"),
