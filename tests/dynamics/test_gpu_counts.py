@@ -10,7 +10,12 @@ from taisoft.backend.paths import AS_WRITTEN, Order, gpu_path
 
 DT, STEPS = 5e-3, 14
 EVENTS = ("run_team", "update_multipliers")  # linear solves with their steps; updates of multipliers
-SEARCHES = ("update_surface", "place_at_end", "set_leg")  # searches, renewals of the geometry, and legs of bent paths
+SEARCHES = (
+    "update_surface",
+    "search_shapes",
+    "place_at_end",
+    "set_leg",
+)  # searches, renewals of the geometry, and legs of bent paths
 
 
 def landing(pair: bool) -> ts.Scene:
