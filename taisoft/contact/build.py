@@ -170,7 +170,7 @@ def drop_vanishing(
     clear_counts(p.room, n)
     ti.loop_config(serialize=p.serial)
     for c in range(n):
-        count_entries(p.room, c, _room(m, found, kept[c]))
+        count_entries(p.room, c, room_of(m, found, kept[c]))
     add_up_counts(p.room, n)
     ti.loop_config(serialize=p.serial)
     for c in range(n):
@@ -219,7 +219,7 @@ def most_entries(m: Model, n: int, n_listed: int) -> int:
 
 
 @ti.func
-def _room(m: ti.template(), found: ti.template(), row):
+def room_of(m: ti.template(), found: ti.template(), row):
     """Most entries that a contact found may need."""
     return m.most_masters * ti.select(found.is_mortar(row), found.entries[row][2], NODES)
 
@@ -268,7 +268,7 @@ def fill(
     clear_counts(p.room, keys_if(s.run[GO], p.count[0]))
     ti.loop_config(serialize=p.serial)
     for c in range(s.run[GO] * p.count[0]):
-        count_entries(p.room, c, _room(m, found, reduction.kept[c]))
+        count_entries(p.room, c, room_of(m, found, reduction.kept[c]))
     add_up_counts(p.room, keys_if(s.run[GO], p.count[0]))
     ti.loop_config(serialize=p.serial)
     for c in range(s.run[GO] * p.count[0]):

@@ -87,6 +87,15 @@ def fold(m: ti.template(), first: ti.template(), last: ti.template(), least: ti.
 
 
 @ti.func
+def share_of_sum(m: ti.template(), team: ti.template(), t, column: ti.template()):
+    """Thread t's share of `total`."""
+    s = ti.cast(0.0, ti.f64)
+    for j in range(team.share(t, m.sums)):
+        s += m.state.partial[team.entry(t, j, m.sums), column]
+    return s
+
+
+@ti.func
 def total(m: ti.template(), column: ti.template()):
     """Sum of a column of the model's partial sums, in a fixed order, after `fold`."""
     s = ti.cast(0.0, ti.f64)
