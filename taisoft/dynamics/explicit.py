@@ -212,11 +212,13 @@ def begin_substep(m: ti.template(), s: ti.template(), row, dt, saves, drifts):
             verlet_drift(m, s, i, dt, verlet_half(m, s, i, dt, verlet_decay(m, s, i, dt)))
         turn_all(m, s, dt)
         if ti.static(s.has_prescribed):
-            prescribe(m, s, row, dt)
-    if ti.static(s.has_varied_loads):
+            prescribe_all(m, s, row, dt)
+    if ti.static(s.has_varied_loads and m.on_cpu):
         ti.loop_config(serialize=True)
         for _ in range(1):
             set_loads(m, s, row)
+    elif ti.static(s.has_varied_loads):
+        set_loads(m, s, row)
 
 
 @ti.func

@@ -32,7 +32,7 @@ from taisoft.dynamics.newton import Newton, solve
 from taisoft.dynamics.results import StageResult, merge
 from taisoft.dynamics.stage import Stage, impact_jump
 from taisoft.dynamics.stage_system import StageSystem
-from taisoft.fem.chunks import chunk_entry, chunk_size, fold, share_of_sum
+from taisoft.fem.chunks import chunk_entry, chunk_size, fold, total_by_team
 from taisoft.fem.lanes import mass_times
 from taisoft.fem.state import IMPACT_CURVATURE, IMPACT_SLOPE, N_NORMS, NORMS, OTHER_SUM, SUM
 
@@ -89,7 +89,8 @@ def measure_impact(m: ti.template(), stage: ti.template(), contacts: ti.template
     fold(m, SUM, OTHER_SUM, ())
     ti.loop_config(serialize=rows.team.alone, block_dim=rows.team.threads)
     for t in range(rows.team.threads):
-        slope, curvature = share_of_sum(m, rows.team, t, SUM), share_of_sum(m, rows.team, t, OTHER_SUM)
+        slope, curvature = total_by_team(m, t, SUM), total_by_team(m, t, OTHER_SUM)
+        slope = ti.select(t == 0, slope, 0.0)
         for j in range(rows.team.share(t, rows.count[0])):
             c = rows.team.entry(t, j, rows.count[0])
             u_fixed = -(SPREAD / tau) * rows.obstacle_displacement[c]
@@ -99,7 +100,7 @@ def measure_impact(m: ti.template(), stage: ti.template(), contacts: ti.template
             slope += to_world(rows, c, rows.r[c]).dot(u_fixed)
             if rows.min_opening[c] > 0.0:
                 slope -= 0.5 * rows.r[c][0] * ti.max(0.0, rows.min_velocity[c] + rows.approach[c])
-        slope, curvature = rows.team.total(t, slope), rows.team.total(t, curvature)
+        slope = rows.team.total(t, slope)
         if t == 0:
             m.state.scalars[IMPACT_SLOPE], m.state.scalars[IMPACT_CURVATURE] = slope, curvature
 

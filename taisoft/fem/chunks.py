@@ -87,12 +87,12 @@ def fold(m: ti.template(), first: ti.template(), last: ti.template(), least: ti.
 
 
 @ti.func
-def share_of_sum(m: ti.template(), team: ti.template(), t, column: ti.template()):
-    """Thread t's share of `total`."""
+def total_by_team(m: ti.template(), t, column: ti.template()):
+    """`total`, for thread t of the model's team: the same number for all threads."""
     s = ti.cast(0.0, ti.f64)
-    for j in range(team.share(t, m.sums)):
-        s += m.state.partial[team.entry(t, j, m.sums), column]
-    return s
+    for j in range(m.team.share(t, m.sums)):
+        s += m.state.partial[m.team.entry(t, j, m.sums), column]
+    return m.team.total(t, s)
 
 
 @ti.func

@@ -3,7 +3,7 @@
 import taichi as ti
 
 from taisoft.backend.runtime import kernel
-from taisoft.fem.chunks import chunk_entry, chunk_size, fold, share_of_sum
+from taisoft.fem.chunks import chunk_entry, chunk_size, fold, total_by_team
 from taisoft.fem.lanes import broadcast, mass_times
 from taisoft.fem.mean_dilatation import find_dilatations
 from taisoft.fem.state import ELASTIC, FIRST_SOFTENED, GRAVITY, KINETIC, LOADS, MIN_J, N_INVERTED
@@ -88,7 +88,7 @@ def measure(m: ti.template()):
                     least = ti.min(least, m.state.partial[m.team.entry(t, j, m.sums), k])
                 result = -m.team.largest(t, -least)
             else:
-                result = m.team.total(t, share_of_sum(m, m.team, t, k))
+                result = total_by_team(m, t, k)
             if t == 0:
                 m.state.scalars[k] = result
         if ti.static(m.has_springs):
