@@ -1,8 +1,8 @@
-"""No loop of n entries runs on one thread of a GPU, where an entry takes microseconds.
+"""No loop over n entries runs on one thread of a GPU, where an entry takes microseconds.
 
-A loop under `ti.loop_config(serialize=True)` may repeat a constant number of operations. Entries belong into parallel loops, loops
-of teams (`serialize=team.alone`), or loops that are serial on the CPU only (`serialize=model.on_cpu`, or behind `ti.static` of
-that). The functions of CPU_ONLY never run on the GPU path.
+A loop under `ti.loop_config(serialize=True)` may repeat a constant number of operations. Entries belong into parallel loops, into
+loops of teams (`serialize=team.alone`), or into loops that are serial on the CPU only (`serialize=model.on_cpu`, or behind a
+`ti.static` of that). The functions of CPU_ONLY never run on the GPU path.
 """
 
 import ast
@@ -46,9 +46,11 @@ def functions() -> dict[str, list[tuple[str, ast.FunctionDef]]]:
     """Kernel code by name, with its file: functions of one name are not told apart, nor are methods."""
     found = {}
     for path in FILES:
-        for node in ast.walk(tree(path)):
-            if is_func(node):
-                found.setdefault(node.name, []).append((str(path.relative_to(PACKAGE)), node))
+        if "import taichi as ti" in path.read_text(encoding="utf-8"):
+            for node in tree(path).body:
+                for inner in getattr(node, "body", []) if isinstance(node, ast.ClassDef) else [node]:
+                    if is_func(inner):
+                        found.setdefault(inner.name, []).append((str(path.relative_to(PACKAGE)), inner))
     return found
 
 
