@@ -1,7 +1,7 @@
 """Kernels that a team or many threads run on a GPU give what one thread gives, whatever the order of the entries.
 
-Each launch in a simulation is repeated with the same data and loops as on a GPU, with teams in two orders of their threads. Numbers
-and choices are the same; sums differ by rounding.
+Each launch in a simulation is repeated with the same data and loops as on a GPU, with teams in two orders of their threads.
+Numbers and choices are the same; sums differ by rounding.
 """
 
 import dataclasses
@@ -10,7 +10,6 @@ import numpy as np
 
 import taisoft as ts
 from taisoft.backend.arrays import Array
-from taisoft.backend.lists import Lists
 from taisoft.backend.paths import Order
 from taisoft.backend.team import Team
 from taisoft.collision import bvh, detector, path_check
