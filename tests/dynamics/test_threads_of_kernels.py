@@ -12,7 +12,7 @@ import taisoft as ts
 from taisoft.backend.arrays import Array
 from taisoft.backend.paths import Order
 from taisoft.backend.team import Team
-from taisoft.collision import bvh, detector, path_check
+from taisoft.collision import detector
 from taisoft.dynamics import contact_measures, dynamics, friction, impact, misplaced, rebounds, renewal
 
 ORDERS = (Order(7), Order(64, True))
@@ -21,8 +21,7 @@ EXACT, SUMS = 0.0, 1e-11  # tolerance, relative to the largest number of an arra
 KERNELS = (
     *((renewal, name, EXACT) for name in ("judge", "adopt", "largest_motion")),
     *((contact_measures, name, EXACT) for name in ("measure_closing", "drop_uncertain")),
-    *((detector, name, EXACT) for name in ("update_surface", "find_proximity", "find_analytic", "find_crossings")),
-    *((path_check, "check_paths", EXACT), (bvh, "refit", EXACT)),
+    *((detector, name, EXACT) for name in ("update_surface", "find_crossings")),
     (rebounds, "find_rebounds", EXACT),
     (misplaced, "add_step", SUMS),
     (friction, "extrapolate_multipliers", SUMS),
