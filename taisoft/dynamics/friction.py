@@ -169,7 +169,7 @@ def _coefficients(contacts: ti.template(), t, n_remembered):
     dot = ti.Vector([0.0, 0.0, 0.0, 0.0, 0.0], ti.f64)  # a.a, a.b, b.b, a.f, b.f
     if n_remembered > 0:
         for j in range(rows.team.share(t, rows.count[0])):
-            c = rows.team.entry(t, j, rows.count[0])
+            c = rows.team.term(t, j)
             f, last = rows.r[c] - work.multiplier[c], work.past_change[PAST * c]
             a, b = f - last, dvec(0.0)
             if n_remembered > 1:

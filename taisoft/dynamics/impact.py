@@ -55,12 +55,12 @@ def begin_impact(m: ti.template(), stage: ti.template(), contacts: ti.template()
     for t in range(rows.team.threads):
         speed, mass = ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64)
         for j in range(rows.team.share(t, rows.count[0])):
-            c = rows.team.entry(t, j, rows.count[0])
+            c = rows.team.term(t, j)
             rows.impact_impulse[c] = rows.r[c]
             rows.r[c] = dvec(0.0)
             speed = ti.max(speed, rows.min_velocity[c] - rows.approach[c])
         for j in range(rows.team.share(t, m.n_nodes)):
-            mass += ti.cast(m.mass[rows.team.entry(t, j, m.n_nodes)], ti.f64) ** 2
+            mass += ti.cast(m.mass[rows.team.term(t, j)], ti.f64) ** 2
         speed, mass = rows.team.largest(t, speed), rows.team.total(t, mass)
         if t == 0:
             for j in ti.static(range(N_NORMS)):
@@ -92,7 +92,7 @@ def measure_impact(m: ti.template(), stage: ti.template(), contacts: ti.template
         slope, curvature = total_by_team(m, t, SUM), total_by_team(m, t, OTHER_SUM)
         slope = ti.select(t == 0, slope, 0.0)
         for j in range(rows.team.share(t, rows.count[0])):
-            c = rows.team.entry(t, j, rows.count[0])
+            c = rows.team.term(t, j)
             u_fixed = -(SPREAD / tau) * rows.obstacle_displacement[c]
             for e in range(rows.first[c], rows.first[c] + rows.arity[c]):
                 i = rows.node[e]
@@ -138,7 +138,7 @@ def rebound_work(contacts: ti.template(), beta: ti.f64) -> ti.f64:
     for t in range(rows.team.threads):
         own = ti.cast(0.0, ti.f64)
         for j in range(rows.team.share(t, rows.count[0])):
-            c = rows.team.entry(t, j, rows.count[0])
+            c = rows.team.term(t, j)
             if rows.min_opening[c] > 0.0:
                 displacement = work.tangential_offset[c]
                 for e in range(rows.first[c], rows.first[c] + rows.arity[c]):

@@ -244,7 +244,7 @@ def _sum_by_team(p: ti.template(), n_colliders, sums: ti.template(), n_rows, t):
         if sums[k, PAIR] >= 0.0:
             own = ti.Vector([0.0, 0.0, 0.0, 0.0], ti.f64)
             for j in range(p.team.share(t, p.count[0])):
-                c = p.team.entry(t, j, p.count[0])
+                c = p.team.term(t, j)
                 if p.renewal.source[c] == k:
                     one = p.sweep.sweep_start[c]
                     own += ti.Vector([one[0], one[1], one[2], p.r[c].norm()], ti.f64)

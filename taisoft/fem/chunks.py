@@ -91,7 +91,7 @@ def total_by_team(m: ti.template(), t, column: ti.template()):
     """`total`, for thread t of the model's team: the same number for all threads."""
     s = ti.cast(0.0, ti.f64)
     for j in range(m.team.share(t, m.sums)):
-        s += m.state.partial[m.team.entry(t, j, m.sums), column]
+        s += m.state.partial[m.team.term(t, j), column]
     return m.team.total(t, s)
 
 

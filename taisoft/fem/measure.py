@@ -85,7 +85,7 @@ def measure(m: ti.template()):
             if ti.static(k in LEAST):
                 least = m.state.partial[0, k]
                 for j in range(m.team.share(t, m.sums)):
-                    least = ti.min(least, m.state.partial[m.team.entry(t, j, m.sums), k])
+                    least = ti.min(least, m.state.partial[m.team.term(t, j), k])
                 result = -m.team.largest(t, -least)
             else:
                 result = total_by_team(m, t, k)
@@ -94,8 +94,8 @@ def measure(m: ti.template()):
         if ti.static(m.has_springs):
             elastic, potential = ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64)
             for j in range(m.team.share(t, m.springs.n_lines)):
-                elastic += springs.elastic_energy(m, m.team.entry(t, j, m.springs.n_lines))
-                potential += springs.load_energy(m, m.team.entry(t, j, m.springs.n_lines))
+                elastic += springs.elastic_energy(m, m.team.term(t, j))
+                potential += springs.load_energy(m, m.team.term(t, j))
             elastic, potential = m.team.total(t, elastic), m.team.total(t, potential)
             if t == 0:
                 m.state.scalars[ELASTIC] = m.state.scalars[ELASTIC] + elastic

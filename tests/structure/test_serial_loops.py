@@ -20,14 +20,11 @@ CPU_ONLY = {  # (file, function): why it does not run on the GPU path, or why it
     **{("linear/factor.py", name): "direct solves are the CPU's" for name in ("apply", "substitute_once")},
     ("linear/coarse_correction.py", "correct"): "multigrid is the CPU's, beside Gauss-Seidel",
     ("dynamics/explicit.py", "advance_alone"): "many sub-steps of small models on one CPU thread",
-    ("contact/solve.py", "_run_serial"): "one CPU thread takes contacts in their order",
+    ("contact/past.py", "enter_past"): "doubles a number until it is large enough",
+    ("collision/reduction.py", "_fill_cells"): "doubles a number until it is large enough",
     **{("view/raster.py", name): "draws pictures, outside of steps" for name in ("set_up", "enlist")},
 }
 REMAINING = {  # file: functions with loops that are still to be divided among threads
-    "collision/reduction.py": ("_fill_cells", "_list_kept"),
-    "contact/build.py": ("enter_past", "keep_impulses", "drop_vanishing", "has_impact"),
-    "contact/solve.py": ("_check", "_extrapolate"),
-    "dynamics/explicit_contact.py": ("predict", "move", "finish_verlet"),
     "dynamics/linearised.py": ("_find_residual",),
     "linear/pcg.py": ("start", "iterate"),
 }
@@ -105,7 +102,10 @@ def called(node: ast.AST) -> str:
 @cache
 def long_functions() -> set[str]:
     """Names of kernel code that contains a loop of run-time length, or calls what does."""
-    nodes = {name: [part for _, node in defined for part in parts(node)] for name, defined in functions().items()}
+    nodes = {
+        name: [part for _, node in defined if "func" in ast.unparse(node.decorator_list[0]) for part in parts(node)]
+        for name, defined in functions().items()
+    }
     found, before = {name for name, own in nodes.items() if any(map(repeats, own))}, set()
     while found != before:
         before = set(found)
