@@ -9,6 +9,9 @@ On CUDA a team is one block of threads. A kernel has one loop over them, whose b
             ...
         team.sync()                              # before a phase that reads what others have written
         total = team.total(t, value)             # the same number for all threads; all must call it
+        for j in range(team.rounds(n)):          # entries in ascending order, such as those of a list that keeps its order
+            i = t + j * team.threads             # may be n or more
+            before, all = team.count(t, flag)
 
 Loops and conditions around phases must be the same for all threads: they depend on arguments, on totals, or on memory that was
 written before the last `sync` and is written again after the next one.
@@ -100,6 +103,50 @@ class Team:
         return result
 
     @ti.func
+    def rounds(self, n):
+        """Return how many rounds the threads need for n entries if each takes one in every round."""
+        return (n + self.threads - 1) // self.threads
+
+    @ti.func
+    def count(self, t, number):
+        """Return the sums of an i32 number over the threads before t, and over all threads."""
+        value = ti.cast(number, ti.f64)
+        return ti.cast(self.before(t, value), ti.i32), ti.cast(self.total(t, value), ti.i32)
+
+    @ti.func
+    def add_up(self, t, numbers: ti.template(), n):
+        """Replace each of n i32 numbers by the sum of those before it. Return the sum of all."""
+        first, last, own = part_first(t, n, self.threads), part_first(t + 1, n, self.threads), 0
+        for k in range(first, last):
+            own += numbers[k]
+        at, total = self.count(t, own)
+        for k in range(first, last):
+            number = numbers[k]
+            numbers[k] = at
+            at += number
+        return total
+
+    @ti.func
+    def list_from(self, t, values: ti.template(), least, n, out: ti.template(), first):
+        """List in out[first:end], ascending, which of n i32 values are at least `least`. Return end."""
+        end = first
+        for j in range(self.rounds(n)):
+            i, listed = t + j * self.threads, 0
+            if i < n:
+                listed = int(values[i] >= least)
+            before, total = self.count(t, listed)
+            if listed == 1:
+                out[end + before] = i
+            end += total
+        self.sync()
+        return end
+
+    @ti.func
+    def least(self, t, number):
+        """Return the least of an i32 number over all threads."""
+        return -ti.cast(self.largest(t, -ti.cast(number, ti.f64)), ti.i32)
+
+    @ti.func
     def _folded(self, t, value, largest: ti.template()):
         result = value
         if ti.static(not self.alone):
@@ -129,28 +176,6 @@ class Team:
 
 
 ALONE = Team()
-
-
-@ti.func
-def keep_marked(team: ti.template(), t, items: ti.template(), marks: ti.template(), scratch: ti.template(), n):
-    """Leave out of items[:n] those whose mark is not 1, in order, by all threads t of a team. Return the number of others.
-
-    scratch: room for n items.
-    """
-    first, last, own = part_first(t, n, team.threads), part_first(t + 1, n, team.threads), 0
-    for k in range(first, last):
-        own += int(marks[k] == 1)
-    at = ti.cast(team.before(t, ti.cast(own, ti.f64)), ti.i32)
-    for k in range(first, last):
-        if marks[k] == 1:
-            scratch[at] = items[k]
-            at += 1
-    left = ti.cast(team.total(t, ti.cast(own, ti.f64)), ti.i32)
-    for j in range(team.share(t, left)):
-        k = team.entry(t, j, left)
-        items[k] = scratch[k]
-    team.sync()
-    return left
 
 
 def make_team(arena: FieldArena, name: str) -> Team:

@@ -250,7 +250,7 @@ def write_analytic(s: ti.template(), o: ti.template(), margin, out: ti.template(
                         if may_touch(s, o, t, k, margin):
                             at = _obstacle_contacts(s, o, t, k, margin, out.data, at, end)
             out.used[c] = at - c * out.part
-    sum_parts(out)
+    sum_parts(s.team, out)
 
 
 @kernel(cse=False)

@@ -103,10 +103,12 @@ class Trees:
     slabs: int  # k / 2
     directions: tuple[tuple[int, int, int], ...]
     n_chunks: Count
+    n_levels: Count  # of the nodes above the chunks
     link: Any  # i32
     root: Any  # i32
     chunk: Any  # i32
     top: Any  # i32
+    top_first: Any  # i32
     lo: Any  # (nodes) vectors f64, one entry per slab [m], scaled by the length of its direction
     hi: Any
 
@@ -165,8 +167,8 @@ def _refit_inner(b: ti.template(), node):
 
 
 @kernel
-def refit(s: ti.template(), b: ti.template(), margin: ti.f64, n_top: ti.i32):
-    """Refit all nodes in the chunks, then the first n_top of those above them one by one."""
+def refit(s: ti.template(), b: ti.template(), margin: ti.f64):
+    """Refit all nodes in the chunks, then those above them level by level."""
     ti.loop_config(serialize=s.serial_cheap)
     for task in range(b.n_chunks * s.cheap_spread):
         if task % s.cheap_spread == 0:
@@ -182,16 +184,13 @@ def refit(s: ti.template(), b: ti.template(), margin: ti.f64, n_top: ti.i32):
                 else:
                     lo, hi = b.bounds(s, t, WHOLE, ti.cast(0.5, ti.f64) * margin)
                     b.lo[node], b.hi[node] = lo, hi
-    ti.loop_config(serialize=True)
-    for k in range(n_top):
-        _refit_inner(b, b.top[k])
-
-
-@kernel
-def refit_level(b: ti.template(), first: ti.i32, last: ti.i32):
-    """Refit the nodes top[first:last] above the chunks, all of one level."""
-    for k in range(first, last):
-        _refit_inner(b, b.top[k])
+    ti.loop_config(serialize=s.team.alone, block_dim=s.team.threads)
+    for t in range(s.team.threads):
+        for level in range(b.n_levels):
+            first, n = b.top_first[level], b.top_first[level + 1] - b.top_first[level]
+            for j in range(s.team.share(t, n)):
+                _refit_inner(b, b.top[first + s.team.entry(t, j, n)])
+            s.team.sync()
 
 
 class Bvh:
@@ -216,16 +215,14 @@ class Bvh:
         )
 
         slabs = {name: arena.vectors(f"bvh_{name}", ti.f64, max(len(t.link), 1), n=k_dop // 2) for name in ("lo", "hi")}
-        indices = {name: integers(arena, f"bvh_{name}", getattr(t, name)) for name in ("link", "root", "chunk", "top")}
-        self.trees = Trees(k_dop // 2, DIRECTIONS[k_dop], len(t.chunk), **indices, **slabs)
-        self.by_levels = not runtime.on_cpu  # else one thread refits the nodes above the chunks, in one launch
+        indices = {
+            name: integers(arena, f"bvh_{name}", getattr(t, name)) for name in ("link", "root", "chunk", "top", "top_first")
+        }
+        self.trees = Trees(k_dop // 2, DIRECTIONS[k_dop], len(t.chunk), len(t.top_first) - 1, **indices, **slabs)
 
     def near(self) -> Trees:
         """Refit the trees to the present boxes and return them, for queries."""
-        first = self.tables.top_first if self.by_levels else []
-        refit(self.surface, self.trees, self.margin, 0 if self.by_levels else len(self.tables.top))
-        for begin, end in zip(first[:-1], first[1:]):
-            refit_level(self.trees, int(begin), int(end))
+        refit(self.surface, self.trees, self.margin)
         return self.trees
 
     search = near  # as of `SpatialHash`

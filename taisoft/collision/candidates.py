@@ -137,16 +137,20 @@ def fill(
 
 
 @ti.func
-def sum_parts(parts: ti.template()):
+def sum_parts(team: ti.template(), parts: ti.template()):
     """Set `count` of a buffer: the entries of the largest part, and of all parts. A top-level loop of a kernel."""
-    ti.loop_config(serialize=True)
-    for _ in range(1):
+    ti.loop_config(serialize=team.alone, block_dim=team.threads)
+    for t in range(team.threads):
         largest, total = 0, 0
-        for c in range(parts.chunks):
-            largest = ti.max(largest, parts.used[c])
-            total += parts.used[c]
-        parts.count[NEEDED] = largest
-        parts.count[TOTAL] = total
+        for j in range(team.share(t, parts.chunks)):
+            used = parts.used[team.entry(t, j, parts.chunks)]
+            largest = ti.max(largest, used)
+            total += used
+        _, total = team.count(t, total)
+        largest = ti.cast(team.largest(t, ti.cast(largest, ti.f64)), ti.i32)
+        if t == 0:
+            parts.count[NEEDED] = largest
+            parts.count[TOTAL] = total
 
 
 @ti.func
@@ -280,8 +284,8 @@ def visit_near(
 def list_pairs(surface: ti.template(), near: ti.template(), row: ti.template(), visitor: ti.template(), out: ti.template()):
     """Write the pairs of a visitor, see `visit_near`."""
     visit_near(surface, near, row, visitor, out, 0)
-    sum_parts(out)
-    sum_parts(row)
+    sum_parts(surface.team, out)
+    sum_parts(surface.team, row)
 
 
 def pair_entries(arena: FieldArena, capacity: int):

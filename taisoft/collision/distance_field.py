@@ -228,6 +228,6 @@ def find_in_fields(
     """Write contacts with distance fields, and count in `fields.unmapped`. The others are as for `visit_near`."""
     fields.unmapped[0] = 0
     visit_near(surface, near, row, fields, out, append)
-    sum_parts(out)
-    sum_parts(row)
+    sum_parts(surface.team, out)
+    sum_parts(surface.team, row)
     sum_pairs(surface)

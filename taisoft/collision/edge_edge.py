@@ -342,6 +342,6 @@ def find_proximity(surface: ti.template(), near: ti.template(), row: ti.template
     mark_sharp_edges(surface)
     visit_near(surface, near, row, visitors.vertices, out, 0)
     visit_near(surface, near, row, visitors.edges, out, 1)
-    sum_parts(out)
-    sum_parts(row)
+    sum_parts(surface.team, out)
+    sum_parts(surface.team, row)
     sum_pairs(surface)

@@ -84,16 +84,23 @@ def find_crossings(surface: ti.template(), near: ti.template(), row: ti.template
 
     visitor: CROSSINGS_OF; out: parts of one 3-vector f64 each; near, row: as in the last search.
     """
-    ti.loop_config(serialize=True)
+    ti.loop_config(serialize=surface.on_cpu)
     for c in range(out.chunks):
         out.data[c] = dvec(0.0)
     visit_near(surface, near, row, visitor, out, 0)
-    sum_parts(row)
-    ti.loop_config(serialize=True)
-    for c in range(1, out.chunks):
-        total = out.data[0][CROSSINGS] + out.data[c][CROSSINGS]
-        out.data[0] = ti.max(out.data[0], out.data[c])
-        out.data[0][CROSSINGS] = total
+    sum_parts(surface.team, row)
+    (team,) = ti.static((surface.team,))
+    ti.loop_config(serialize=team.alone, block_dim=team.threads)
+    for t in range(team.threads):
+        worst, crossings = dvec(0.0), ti.cast(0.0, ti.f64)
+        for j in range(team.share(t, out.chunks)):
+            c = team.entry(t, j, out.chunks)
+            worst = ti.max(worst, out.data[c])
+            crossings += out.data[c][CROSSINGS]
+        depth, relative = team.largest(t, worst[CROSSING_DEPTH]), team.largest(t, worst[DEPTH_OVER_EDGE])
+        total = team.total(t, crossings)
+        if t == 0:
+            out.data[0] = dvec(depth, relative, total)
 
 
 @ti.func

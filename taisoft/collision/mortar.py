@@ -255,7 +255,7 @@ def find_mortar(
                     if v[at][k] >= 0:
                         overlay.is_near[v[at][k]] = 1
     visit_near(surface, near, row, overlay, points, 1)  # keeps what the search by proximity needs of `row`
-    sum_parts(points)
+    sum_parts(surface.team, points)
     ti.loop_config(serialize=surface.serial_cheap)
     for i in range(surface.n_verts):
         if overlay.is_slave[i] == 1 and points.count[NEEDED] <= points.part:
@@ -276,6 +276,6 @@ def find_mortar(
                     of_a = _is_beside(surface, overlay, out.data, out.data.nodes_a[at], body[1])
                     of_b = _is_beside(surface, overlay, out.data, out.data.nodes_b[at], body[0])
                     out.data.guard[at] = int(of_a or of_b)
-    sum_parts(lists)
-    sum_parts(out)
-    sum_parts(row)
+    sum_parts(surface.team, lists)
+    sum_parts(surface.team, out)
+    sum_parts(surface.team, row)

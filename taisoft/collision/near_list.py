@@ -17,6 +17,7 @@ from typing import Any
 import taichi as ti
 
 from taisoft.backend.arrays import Count
+from taisoft.backend.lists import part_first
 from taisoft.collision.surface import ACTIVE, dvec, may_meet
 
 SEARCHED, TO_STATE, STILL, GIVEN = range(4)  # which paths are checked
@@ -115,16 +116,25 @@ def clear_ends(s: ti.template(), g: ti.template()):
 def _compare_with_listed(s: ti.template(), g: ti.template(), limit):
     """Set whether vectors by which two colliders have left the listed paths differ by more than `limit` [m] along an axis."""
     ti.loop_config(serialize=s.serial_cheap)
-    for task in range(s.n_bodies * s.cheap_spread):
+    for k in range(2 * s.n_bodies):
+        g.left_lo[k], g.left_hi[k] = dvec(ti.math.inf), dvec(-ti.math.inf)
+    ti.loop_config(serialize=s.serial_cheap)
+    for task in range(s.chunks * s.cheap_spread):
         if task % s.cheap_spread == 0:
-            b = task // s.cheap_spread
-            lo0, hi0, lo1, hi1 = dvec(ti.math.inf), dvec(-ti.math.inf), dvec(ti.math.inf), dvec(-ti.math.inf)
-            for i in range(g.first_vertex[b], g.first_vertex[b + 1]):
-                if g.can_touch[i] == 1:
-                    now = s.x[i] - g.listed_x[i]
-                    first, last = leaving(now, g.listed_move[i]), leaving(now + g.path[i], g.listed_move[i])
-                    lo0, hi0, lo1, hi1 = ti.min(lo0, first), ti.max(hi0, first), ti.min(lo1, last), ti.max(hi1, last)
-            g.left_lo[2 * b], g.left_hi[2 * b], g.left_lo[2 * b + 1], g.left_hi[2 * b + 1] = lo0, hi0, lo1, hi1
+            c = task // s.cheap_spread
+            begin, end = part_first(c, s.n_verts, s.chunks), part_first(c + 1, s.n_verts, s.chunks)
+            for b in range(s.n_bodies):
+                lo0, hi0, lo1, hi1 = dvec(ti.math.inf), dvec(-ti.math.inf), dvec(ti.math.inf), dvec(-ti.math.inf)
+                for i in range(ti.max(g.first_vertex[b], begin), ti.min(g.first_vertex[b + 1], end)):
+                    if g.can_touch[i] == 1:
+                        now = s.x[i] - g.listed_x[i]
+                        first, last = leaving(now, g.listed_move[i]), leaving(now + g.path[i], g.listed_move[i])
+                        lo0, hi0, lo1, hi1 = ti.min(lo0, first), ti.max(hi0, first), ti.min(lo1, last), ti.max(hi1, last)
+                if lo0[0] <= hi0[0]:
+                    ti.atomic_min(g.left_lo[2 * b], lo0)
+                    ti.atomic_max(g.left_hi[2 * b], hi0)
+                    ti.atomic_min(g.left_lo[2 * b + 1], lo1)
+                    ti.atomic_max(g.left_hi[2 * b + 1], hi1)
     ti.loop_config(serialize=s.serial_cheap)
     for task in range(s.n_bodies * s.cheap_spread):
         if task % s.cheap_spread == 0:

@@ -280,7 +280,7 @@ def check_paths(
             out.used[c] = at - c * out.part
     if ti.static(g.has_pairs):
         clear_ends(s, g)
-    sum_parts(out)
+    sum_parts(s.team, out)
     ti.loop_config(serialize=True)
     for _ in range(1):
         if event != 0 and s.run[GO] == 1 and g.left[UNCOVERED] + g.left[OUTDATED] + out.count[TOTAL] > 0:
@@ -300,7 +300,7 @@ def append_passages(
     """Append a contact for each passage (k,4) to the buffer of contacts: between its features at a time (k,) along the
     searched paths. Their normal then holds them apart; the gap is that of the same points now.
     """
-    ti.loop_config(serialize=True)
+    ti.loop_config(serialize=s.on_cpu)
     for c in range(out.chunks):
         at, last, r = c * out.part + append * out.used[c], (c + 1) * out.part, c
         while r < pairs.shape[0]:  # dealt out to the parts in turn
@@ -333,7 +333,7 @@ def append_passages(
                 at += 1
             r += out.chunks
         out.used[c] = at - c * out.part
-    sum_parts(out)
+    sum_parts(s.team, out)
 
 
 @dataclass(frozen=True, eq=False)

@@ -101,11 +101,13 @@ def _bucket(grid: ti.template(), first, count, k):
 
 @kernel
 def list_cells(surface: ti.template(), grid: ti.template(), members: ti.template(), inverse: ti.f64):
-    """Find the cells of each active triangle and where the list of each cell starts; list the large triangles.
+    """Find the cells of each active triangle and where the list of each cell starts; list the large triangles, in
+    any order.
 
     members: buffer of the triangles by cell, whose needed size is set.
     """
     clear_counts(grid.cells, grid.n_cells)
+    grid.count[N_LARGE] = 0
     ti.loop_config(serialize=surface.serial)
     for i in range(surface.count[ACTIVE]):
         t = surface.active[i]
@@ -114,15 +116,8 @@ def list_cells(surface: ti.template(), grid: ti.template(), members: ti.template
         grid.cell_count[t] = count
         for k in range(count[0] * count[1] * count[2]):
             count_entry(grid.cells, _bucket(grid, first, count, k))
-    ti.loop_config(serialize=True)
-    for _ in range(1):
-        n = 0
-        for j in range(surface.count[ACTIVE]):
-            t = surface.active[j]
-            if grid.cell_count[t][0] == 0:
-                grid.large[n] = t
-                n += 1
-        grid.count[N_LARGE] = n
+        if count[0] == 0:
+            grid.large[ti.atomic_add(grid.count[N_LARGE], 1)] = t
     add_up_counts(grid.cells, grid.n_cells)
     ti.loop_config(serialize=True)
     for _ in range(1):
@@ -196,7 +191,7 @@ def find_rows(surface: ti.template(), grid: ti.template(), members: ti.template(
                     grid.end[t] = at
                     sort_range(out.data, begin, at)
             out.used[c] = at - c * out.part
-    sum_parts(out)
+    sum_parts(surface.team, out)
 
 
 class SpatialHash:

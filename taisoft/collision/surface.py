@@ -14,9 +14,10 @@ import taichi as ti
 
 from taisoft.backend import parallel
 from taisoft.backend.arrays import Count, FieldArena
-from taisoft.backend.lists import part_first, spread_on, sum_before
+from taisoft.backend.lists import part_first, spread_on
 from taisoft.backend.paths import gpu_threads
 from taisoft.backend.runtime import Runtime, kernel
+from taisoft.backend.team import Team, make_team
 from taisoft.collision.colliders import Topology
 from taisoft.fem.state import GO
 
@@ -45,6 +46,7 @@ class Surface:
     chunks: int
     spread: int  # loop iterations per chunk, see SPREAD
     cheap_spread: int  # the same for cheap loops
+    team: Team  # of loops over chunks
     triangle: Any
     body: Any
     node: Any
@@ -74,7 +76,7 @@ class Surface:
     active_of_chunk: Any  # i32: the same, those of each chunk from its first triangle on
     count: Any  # (4) i32: numbers of NONFINITE and ACTIVE triangles, and of (query, nearby triangle) PAIRS
     run: Any  # (2) i32: 1, or 0 once a batch of sub-steps has ended early; the event that has ended it, see `explicit_batch`
-    part: Any  # (chunks) i32: count of each chunk
+    part: Any  # (chunks + 1) i32: count of each chunk
     near: Any  # (chunks * n_bodies) i32: colliders near each chunk's current collider
     sharp: Any  # (n_triangles) i32: edge bits, see `mark_sharp_edges`
     inside: Any  # (n_verts) i32: bit k % INSIDE_BITS is set if the vertex is in collider k and has contacts that move it out
@@ -114,7 +116,7 @@ def build_surface(
     tables |= {name: properties[name] for name in ("soft", "self_on")}
     vectors = dict.fromkeys(("x", "move"), v) | dict.fromkeys(("lo", "hi", "normal"), n)
     vectors |= dict.fromkeys(("body_lo", "body_hi"), bodies)
-    zeros = {"active": n, "active_of_chunk": n, "count": 4, "part": chunks, "near": chunks * bodies, "sharp": n, "inside": v}
+    zeros = {"active": n, "active_of_chunk": n, "count": 4, "part": chunks + 1, "near": chunks * bodies, "sharp": n, "inside": v}
     zeros |= {"rests": bodies}
     run = arena.field("surface_run", ti.i32, 2, np.array([1, 0]))
     # triangles are rows, not vectors: the compiler confuses run-time and fixed component indices within one kernel
@@ -133,6 +135,7 @@ def build_surface(
         chunks=chunks,
         spread=spread_on(on_cpu, serial),
         cheap_spread=spread_on(on_cpu, serial_cheap),
+        team=make_team(arena, "surface"),
         mode=integers(arena, "contact_mode", properties["mode"]),
         attached=integers(arena, "attached", attached.reshape(-1)) if attached is not None and attached.any() else None,
         rest=arena.vectors("surface_rest", ti.f64, max(v, 1), rest if v else None),
@@ -283,9 +286,15 @@ def list_near(s: ti.template(), c, own):
 @ti.func
 def sum_pairs(surface: ti.template()):
     """Sum the tested pairs of all parts. A top-level loop of a kernel."""
-    ti.loop_config(serialize=True)
-    for _ in range(1):
-        surface.count[PAIRS] = sum_before(surface.part, surface.chunks)
+    (team,) = ti.static((surface.team,))
+    ti.loop_config(serialize=team.alone, block_dim=team.threads)
+    for t in range(team.threads):
+        pairs = 0
+        for j in range(team.share(t, surface.chunks)):
+            pairs += surface.part[team.entry(t, j, surface.chunks)]
+        _, total = team.count(t, pairs)
+        if t == 0:
+            surface.count[PAIRS] = total
 
 
 @ti.func
@@ -322,13 +331,16 @@ def _list_active(surface: ti.template()):
                     surface.active_of_chunk[first + n] = t
                     n += 1
             surface.part[c] = n
+    ti.loop_config(serialize=surface.team.alone, block_dim=surface.team.threads)
+    for t in range(surface.team.threads):
+        total = surface.team.add_up(t, surface.part, surface.chunks)
+        if t == 0:
+            surface.part[surface.chunks] = surface.count[ACTIVE] = total
     ti.loop_config(serialize=surface.on_cpu)
     for c in range(surface.chunks):
-        at, first = sum_before(surface.part, c), part_first(c, surface.n_triangles, surface.chunks)
-        for k in range(surface.part[c]):
+        at, first = surface.part[c], part_first(c, surface.n_triangles, surface.chunks)
+        for k in range(surface.part[c + 1] - at):
             surface.active[at + k] = surface.active_of_chunk[first + k]
-        if c == surface.chunks - 1:
-            surface.count[ACTIVE] = at + surface.part[c]
 
 
 @kernel

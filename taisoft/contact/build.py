@@ -12,7 +12,6 @@ import taichi as ti
 from taisoft.backend.arrays import FieldArena
 from taisoft.backend.lists import add_up_counts, clear_counts, count_entries, keys_if
 from taisoft.backend.runtime import kernel
-from taisoft.backend.team import keep_marked
 from taisoft.contact.past import keep_impulses, load_of, warm_impulse
 from taisoft.contact.problem import NODES, fill_field, list_entries, to_frame
 from taisoft.contact.prox import OPEN, SLIP, dvec, prox, scaled, state_of, tangent
@@ -170,7 +169,7 @@ def drop_vanishing(
     clear_counts(p.room, n)
     ti.loop_config(serialize=p.serial)
     for c in range(n):
-        count_entries(p.room, c, _room(m, found, kept[c]))
+        count_entries(p.room, c, room_of(m, found, kept[c]))
     add_up_counts(p.room, n)
     ti.loop_config(serialize=p.serial)
     for c in range(n):
@@ -179,13 +178,21 @@ def drop_vanishing(
         for e in range(p.first[own], p.first[own] + p.arity[own]):
             largest = ti.max(largest, ti.abs(p.weight[e]))
         p.renewal.match[c] = int(p.arity[own] == 0 or largest > VANISHING)
-    left = 0
+    n_left = 0
     ti.loop_config(serialize=p.team.alone, block_dim=p.team.threads)
     for t in range(p.team.threads):
-        n_left = keep_marked(p.team, t, kept, p.renewal.match, p.renewal.fate, n)
+        left = 0
+        for j in range(p.team.rounds(n)):
+            c, row, stays = t + j * p.team.threads, 0, 0
+            if c < n:
+                row, stays = kept[c], p.renewal.match[c]
+            before, staying = p.team.count(t, stays)
+            if stays == 1:
+                kept[left + before] = row
+            left += staying
         if t == 0:
-            left += n_left
-    return left
+            n_left += left
+    return n_left
 
 
 @ti.func
@@ -219,7 +226,7 @@ def most_entries(m: Model, n: int, n_listed: int) -> int:
 
 
 @ti.func
-def _room(m: ti.template(), found: ti.template(), row):
+def room_of(m: ti.template(), found: ti.template(), row):
     """Most entries that a contact found may need."""
     return m.most_masters * ti.select(found.is_mortar(row), found.entries[row][2], NODES)
 
@@ -268,7 +275,7 @@ def fill(
     clear_counts(p.room, keys_if(s.run[GO], p.count[0]))
     ti.loop_config(serialize=p.serial)
     for c in range(s.run[GO] * p.count[0]):
-        count_entries(p.room, c, _room(m, found, reduction.kept[c]))
+        count_entries(p.room, c, room_of(m, found, reduction.kept[c]))
     add_up_counts(p.room, keys_if(s.run[GO], p.count[0]))
     ti.loop_config(serialize=p.serial)
     for c in range(s.run[GO] * p.count[0]):

@@ -77,6 +77,9 @@ class RenewalWork:
     target: Any  # f64: target of each new contact [m]
     height: Any  # f64: of each new contact, its gap minus what it has opened since the step's start [m]
     is_kept: Any  # i32: 1 at the first contact of a pair of colliders whose contacts stay as they are
+    heir: Any  # i32: of each present contact, the new one that gets its impulse, -1 if none does
+    giver: Any  # i32: of each new contact, the first present one whose heir it is, or the number of these
+    source: Any  # i32: of each contact of the next geometry, the present or new one that it comes from
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,7 +151,7 @@ def build_node_problem(arena: FieldArena, capacity: int, n_nodes: int, serial: b
         by_feature=make_lists(arena, "past_contact", n_slots, serial),
     )
     renewal = RenewalWork(
-        **_fields(arena, "fate match is_kept", ti.i32, n, 0, "renewal"),
+        **_fields(arena, "fate match is_kept heir giver source", ti.i32, n, 0, "renewal"),
         **_fields(arena, "target height", ti.f64, n, 0, "renewal"),
         **_fields(arena, "inherited", ti.f64, n, 3, "renewal"),
     )

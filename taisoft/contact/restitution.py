@@ -47,22 +47,21 @@ def find_rebounds(p: ti.template(), gravity: ti.template(), flight: ti.template(
     if it is not in flight. A contact without a rebound may close, or approach as fast as it separates now, which takes no work.
     """
     rebounds = 0
-    ti.loop_config(serialize=True)
-    for _ in range(1):
-        for c in range(p.count[0]):
-            u, e, contact_offset = p.approach[c], p.restitution[c], contact_offset_of(p, c, common_offset)
-            distance = ti.max(0.0, p.gap[c] - contact_offset)
-            a, b = p.body[c][0], p.body[c][1]
-            gravity_n = p.normal[c].dot(ti.cast(gravity[0], ti.f64))
-            closing = ti.max(0.0, -gravity_n * (ti.cast(flight[a] > 0.0, ti.f64) - ti.cast(flight[b] > 0.0, ti.f64)))
-            velocity, opening = -ti.max(distance / dt, u), ti.cast(0.0, ti.f64)
-            if e > 0.0 and u < 0.0 and p.gap[c] - contact_offset + dt * (u - dt * closing) < 0.0:
-                impact_speed = ti.min(dt * closing - u, ti.sqrt(u * u + ti.abs(flight[a] - flight[b]) * closing * closing))
-                w_squared = e * e * (impact_speed * impact_speed + 2.0 * closing * distance) - 2.0 * closing * distance
-                w = ti.sqrt(ti.max(0.0, w_squared))
-                opened = dt * (w - dt * ti.abs(gravity_n))
-                if opened > NEGLIGIBLE_OPENING * contact_offset:
-                    velocity, opening = w, opened
-                    rebounds += 1
-            p.min_velocity[c], p.min_opening[c] = velocity, opening
+    ti.loop_config(serialize=p.on_cpu)
+    for c in range(p.count[0]):
+        u, e, contact_offset = p.approach[c], p.restitution[c], contact_offset_of(p, c, common_offset)
+        distance = ti.max(0.0, p.gap[c] - contact_offset)
+        a, b = p.body[c][0], p.body[c][1]
+        gravity_n = p.normal[c].dot(ti.cast(gravity[0], ti.f64))
+        closing = ti.max(0.0, -gravity_n * (ti.cast(flight[a] > 0.0, ti.f64) - ti.cast(flight[b] > 0.0, ti.f64)))
+        velocity, opening = -ti.max(distance / dt, u), ti.cast(0.0, ti.f64)
+        if e > 0.0 and u < 0.0 and p.gap[c] - contact_offset + dt * (u - dt * closing) < 0.0:
+            impact_speed = ti.min(dt * closing - u, ti.sqrt(u * u + ti.abs(flight[a] - flight[b]) * closing * closing))
+            w_squared = e * e * (impact_speed * impact_speed + 2.0 * closing * distance) - 2.0 * closing * distance
+            w = ti.sqrt(ti.max(0.0, w_squared))
+            opened = dt * (w - dt * ti.abs(gravity_n))
+            if opened > NEGLIGIBLE_OPENING * contact_offset:
+                velocity, opening = w, opened
+                rebounds += 1
+        p.min_velocity[c], p.min_opening[c] = velocity, opening
     return rebounds

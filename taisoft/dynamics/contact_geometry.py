@@ -24,13 +24,14 @@ more than MISSED of the contact offset, and no new contact violates its target.
 
 import taichi as ti
 
+from taisoft.backend.lists import add_up_counts, clear_counts, count_entries
 from taisoft.backend.runtime import kernel
 from taisoft.collision.analytic import HALF_SPACE, rotation_rows
 from taisoft.collision.contacts import EDGE_EDGE, FACE_FACE, FACE_FIELD, MORTAR, VERTEX_FACE
 from taisoft.collision.features import closest_lines
 from taisoft.collision.overlay import BEHIND
 from taisoft.collision.surface import dvec
-from taisoft.contact.build import fill_row
+from taisoft.contact.build import fill_row, room_of
 from taisoft.contact.past import enter_past, pair_slot, past_of
 from taisoft.contact.problem import to_frame
 from taisoft.contact.prox import prox, tangent
@@ -42,8 +43,8 @@ STILL = 0.2  # of the contact offset: where all contacts have moved less, normal
 TRUSTED_DEPTH, TRUSTED_CLOSING = 0.5, 0.5  # of the margin; of the finer side's edge
 DEEPEST = 0.1  # of the contact offset: gap below which a new deepest point counts
 SAME_NORMAL = 0.9  # cosine between normals of a contact and its heir
-KEPT, IN_PLACE, REPLACED, GONE, OPEN = range(5)  # fates of present contacts
-REJECTED, NEW = -2, -1  # of contacts found that replace none
+REPLACED, GONE, OPEN, KEPT, IN_PLACE = range(5)  # fates of present contacts; those from KEPT on stay
+REJECTED, NEW = -2, -1  # of contacts found that replace none; those from NEW on become present ones
 
 
 @ti.func
@@ -174,13 +175,17 @@ def _heir(p: ti.template(), found: ti.template(), kept: ti.template(), n, c):
 def _keep_untrusted(
     p: ti.template(), s: ti.template(), displacement: ti.template(), found: ti.template(), kept: ti.template(), n, dt, margin
 ):
-    """Mark the pairs whose contacts stay as they are."""
+    """Mark the pairs whose contacts stay as they are. Top-level loops of a kernel."""
+    ti.loop_config(serialize=p.serial)
     for c in range(p.count[0]):
-        p.renewal.is_kept[c] = 0
+        p.renewal.is_kept[c], p.renewal.heir[c] = 0, -1
+    ti.loop_config(serialize=p.serial)
+    for c in range(p.count[0]):
         if p.body[c][0] != p.body[c][1]:  # all contacts of a body with itself are one pair
             closing = -ti.min(p.normal[c].dot(_motion(p, c, displacement)), dt * p.approach[c])
             if closing > ti.cast(TRUSTED_CLOSING, ti.f64) * _finer_edge(s, p.body[c]):
                 p.renewal.is_kept[p.past.pair[c]] = 1
+    ti.loop_config(serialize=p.serial)
     for b in range(n):
         if found.gap[kept[b]] < -ti.cast(TRUSTED_DEPTH, ti.f64) * margin:
             first = p.past.pair_slot[pair_slot(p, found.body[kept[b]])]
@@ -212,6 +217,19 @@ def _judge_present(
 
 
 @ti.func
+def _match_found(p: ti.template(), found: ti.template(), row, b, n, margin):
+    """Set `match` of contact b of n found, in a row of the buffer, to the present one with its features, unless it is not
+    trusted; claim that one, which the first claim gets: `fate` becomes b - n."""
+    j, first = past_of(p, found.feature[row], found.point[row]), p.past.pair_slot[pair_slot(p, found.body[row])]
+    is_kept = found.gap[row] < -ti.cast(TRUSTED_DEPTH, ti.f64) * margin
+    if first >= 0:
+        is_kept = is_kept or p.renewal.is_kept[first] == 1
+    if j >= 0 and not is_kept and found.feature[row][0] != FACE_FIELD:
+        ti.atomic_min(p.renewal.fate[j], b - n)
+    p.renewal.match[b] = ti.select(is_kept, REJECTED, j)
+
+
+@ti.func
 def _judge_found(
     p: ti.template(),
     s: ti.template(),
@@ -221,35 +239,31 @@ def _judge_found(
     found: ti.template(),
     row,
     b,
+    n_found,
     common_offset,
-    margin,
     floor,
 ):
-    """Match contact b found, in a row of the buffer, with a present one; set its height and target. Return 1 if it changes the
-    geometry."""
+    """Judge contact b of n_found, in a row of the buffer, after `_match_found`; set its height and target. Return 1 if it changes
+    the geometry."""
     n, gap, body, changed = found.normal[row], found.gap[row], found.body[row], 0
     motion = _found_motion(s, end, o, found, row)
     height, offset = gap - n.dot(motion), offset_between(body, found.guard[row], common_offset)
-    j, first = past_of(p, found.feature[row], found.point[row]), p.past.pair_slot[pair_slot(p, body)]
+    j = p.renewal.match[b]
     match = j
-    is_kept = gap < -ti.cast(TRUSTED_DEPTH, ti.f64) * margin
-    if first >= 0:
-        is_kept = is_kept or p.renewal.is_kept[first] == 1
     lowest = -ti.cast(BEHIND, ti.f64) * _slip(motion, n) - floor
     nearest = j
-    if j < 0 and (height < lowest or gap < offset):
+    if j == NEW and (height < lowest or gap < offset):
         nearest = _nearest_present(p, found.feature[row][0], body, found.point[row])
         if nearest >= 0:  # what is behind each other there may be so here
             lowest += ti.min(p.gap[nearest], 0.0)
-    if is_kept or (j < 0 and height < lowest):
+    if j == REJECTED or (j < 0 and height < lowest):
         match = REJECTED
     elif found.feature[row][0] == FACE_FIELD:
         match = ti.select(gap < ti.cast(DEEPEST, ti.f64) * offset, NEW, REJECTED)
     elif j >= 0:
-        if p.renewal.fate[j] == REPLACED:
+        if p.renewal.fate[j] != b - n_found:
             match = NEW
         else:
-            p.renewal.fate[j] = REPLACED
             p.renewal.target[b] = ti.min(p.target[j], offset)
             old = _motion(p, j, displacement)
             known = p.gap[j] + p.normal[j].dot(old)
@@ -294,43 +308,49 @@ def judge(
     """
     enter_past(p, 1)
     changed = 0
-    ti.loop_config(serialize=True)
-    for _ in range(1):
-        _keep_untrusted(p, s, displacement, found, kept, n, dt, margin)
-        for c in range(p.count[0]):
-            changed |= _judge_present(p, o, c, x_start, displacement, common_offset, margin)
-        for b in range(n):
-            changed |= _judge_found(p, s, end, o, displacement, found, kept[b], b, common_offset, margin, floor)
-        for c in range(p.count[0]):
-            if p.renewal.fate[c] == OPEN:
-                b, same = _heir(p, found, kept, n, c)
-                pushes = p.r[c][0] > 0.0
-                is_gone = same or pushes
-                if pushes and p.feature[c][0] == EDGE_EDGE:
-                    is_gone = not _still_cross(p, s, end, c)
-                if is_gone:
-                    p.renewal.fate[c] = GONE
-                    changed |= int(pushes)
-                    if pushes and b >= 0:
-                        p.renewal.inherited[b] = p.renewal.inherited[b] + p.past.impulse[c]
-                else:
-                    p.renewal.fate[c] = KEPT
+    _keep_untrusted(p, s, displacement, found, kept, n, dt, margin)
+    ti.loop_config(serialize=p.serial)
+    for c in range(p.count[0]):
+        changed |= _judge_present(p, o, c, x_start, displacement, common_offset, margin)
+    ti.loop_config(serialize=p.serial)
+    for b in range(n):
+        _match_found(p, found, kept[b], b, n, margin)
+    ti.loop_config(serialize=p.serial)
+    for b in range(n):
+        changed |= _judge_found(p, s, end, o, displacement, found, kept[b], b, n, common_offset, floor)
+        p.renewal.giver[b] = p.count[0]
+    ti.loop_config(serialize=p.serial)
+    for c in range(p.count[0]):
+        if p.renewal.fate[c] < 0:
+            p.renewal.fate[c] = REPLACED
+        elif p.renewal.fate[c] == OPEN:
+            b, same = _heir(p, found, kept, n, c)
+            pushes = p.r[c][0] > 0.0
+            is_gone = same or pushes
+            if pushes and p.feature[c][0] == EDGE_EDGE:
+                is_gone = not _still_cross(p, s, end, c)
+            p.renewal.fate[c] = ti.select(is_gone, GONE, KEPT)
+            if is_gone and pushes:
+                changed |= 1
+                if b >= 0:
+                    p.renewal.heir[c] = b
+                    ti.atomic_min(p.renewal.giver[b], c)
+    ti.loop_config(serialize=p.serial)
+    for b in range(n):
+        for c in range(p.renewal.giver[b], p.count[0]):
+            if p.renewal.heir[c] == b:
+                p.renewal.inherited[b] = p.renewal.inherited[b] + p.past.impulse[c]
     return changed
 
 
 @ti.func
-def _copy(p: ti.template(), c, to, first):
-    """Copy contact c to place `to`, and its entries to those from `first` on, at or before their own."""
-    p.normal[to], p.tangent[to], p.point[to] = p.normal[c], p.tangent[c], p.point[c]
-    p.obstacle_displacement[to], p.impact_impulse[to], p.r[to] = p.obstacle_displacement[c], p.impact_impulse[c], p.r[c]
-    p.body[to], p.feature[to] = p.body[c], p.feature[c]
-    p.gap[to], p.target[to], p.approach[to], p.load[to] = p.gap[c], p.target[c], p.approach[c], p.load[c]
-    p.area[to], p.guard[to], p.status[to] = p.area[c], p.guard[c], p.status[c]
-    p.friction[to], p.restitution[to], p.min_opening[to] = p.friction[c], p.restitution[c], p.min_opening[c]
-    for k in range(p.arity[c]):
-        at, e = first + k, p.first[c] + k
-        p.node[at], p.weight[at], p.contact[at] = p.node[e], p.weight[e], to
-    p.first[to], p.arity[to], p.arity_a[to] = first, p.arity[c], p.arity_a[c]
+def _move(p: ti.template(), t, field: ti.template(), left):
+    """Move the values of a field of the contacts that stay to the first `left` places. For thread t of a team."""
+    for j in range(p.team.rounds(left)):
+        to = ti.min(t + j * p.team.threads, left - 1)
+        value = field[p.renewal.source[to]]
+        p.team.sync()
+        field[to] = value
 
 
 @ti.func
@@ -360,36 +380,49 @@ def adopt(
     n: ti.i32,
 ):
     """Replace the contacts as `judge` has decided, with its arguments; m: Model; q: PairNumbers. They must fit."""
-    ti.loop_config(serialize=True)
-    for _ in range(1):
-        left, entries = 0, 0
-        for c in range(p.count[0]):
-            fate = p.renewal.fate[c]
-            if fate == KEPT or fate == IN_PLACE:
-                _copy(p, c, left, entries)
-                entries += p.arity[left]
-                p.sweep.order[left] = left
-                if ti.static(o.any):
-                    if fate == IN_PLACE:
-                        _renew_in_place(p, o, left, x_start, displacement, p.past.impulse[c])
-                left += 1
-        for b in range(n):
-            match, row = p.renewal.match[b], kept[b]
-            if match != REJECTED:
-                fill_row(p, m, s, q, left, entries, found, row)
-                entries += p.arity[left]
-                if ti.static(o.any):
-                    if found.nodes_b[row][0] < 0:
-                        k = _shape(o, p.body[left][1])
-                        x = p.point[left] - 0.5 * p.gap[left] * p.normal[left]
-                        p.obstacle_displacement[left] = _shape_motion(o, k, x)
-                p.gap[left], p.target[left], p.approach[left], p.load[left] = p.renewal.height[b], p.renewal.target[b], 0.0, 0.0
-                impulse = p.renewal.inherited[b]
-                if match >= 0:
-                    impulse += p.past.impulse[match]
-                p.r[left] = prox(to_frame(p, left, impulse), p.friction[left])
-                left += 1
-        p.count[0], p.count[2] = left, entries
+    vectors = ti.static((p.normal, p.tangent, p.point, p.obstacle_displacement, p.impact_impulse, p.r, p.body, p.feature))
+    numbers = ti.static(
+        (p.gap, p.target, p.approach, p.load, p.area, p.guard, p.status, p.friction, p.restitution, p.min_opening)
+    )
+    n_left = 0
+    clear_counts(p.room, n)
+    ti.loop_config(serialize=p.serial)
+    for b in range(n):
+        count_entries(p.room, b, room_of(m, found, kept[b]))
+    add_up_counts(p.room, n)
+    ti.loop_config(serialize=p.team.alone, block_dim=p.team.threads)
+    for t in range(p.team.threads):
+        left = p.team.list_from(t, p.renewal.fate, KEPT, p.count[0], p.renewal.source, 0)
+        if left < p.count[0]:
+            for fields in ti.static((vectors, numbers, (p.first, p.arity, p.arity_a))):
+                for field in ti.static(fields):
+                    _move(p, t, field, left)
+        end = p.team.list_from(t, p.renewal.match, NEW, n, p.renewal.source, left)
+        if t == 0:
+            p.count[0] = end
+            n_left += left
+    ti.loop_config(serialize=p.serial)
+    for c in range(p.count[0]):
+        if c < n_left:
+            p.sweep.order[c] = c
+            for e in range(p.first[c], p.first[c] + p.arity[c]):
+                p.contact[e] = c
+            if ti.static(o.any):
+                if p.renewal.fate[p.renewal.source[c]] == IN_PLACE:
+                    _renew_in_place(p, o, c, x_start, displacement, p.past.impulse[p.renewal.source[c]])
+        else:
+            b = p.renewal.source[c]
+            fill_row(p, m, s, q, c, p.count[2] + p.room.start[b + 1], found, kept[b])
+            if ti.static(o.any):
+                if found.nodes_b[kept[b]][0] < 0:
+                    x = p.point[c] - 0.5 * p.gap[c] * p.normal[c]
+                    p.obstacle_displacement[c] = _shape_motion(o, _shape(o, p.body[c][1]), x)
+            p.gap[c], p.target[c], p.approach[c], p.load[c] = p.renewal.height[b], p.renewal.target[b], 0.0, 0.0
+            impulse = p.renewal.inherited[b]
+            if p.renewal.match[b] >= 0:
+                impulse += p.past.impulse[p.renewal.match[b]]
+            p.r[c] = prox(to_frame(p, c, impulse), p.friction[c])
+    p.count[2] += p.room.start[n + 1]
 
 
 @ti.func
@@ -410,10 +443,12 @@ def largest_motion(
 ) -> ti.f64:
     """Return the largest displacement of two sides of a contact relative to each other [m], since the step's start or, after
     n_looks, since the displacements (n_nodes) `seen`; contacts whose geometry never changes left out."""
-    largest = ti.cast(0.0, ti.f64)
-    ti.loop_config(serialize=True)
-    for _ in range(1):
-        for c in range(p.count[0]):
+    result = ti.cast(0.0, ti.f64)
+    ti.loop_config(serialize=p.team.alone, block_dim=p.team.threads)
+    for t in range(p.team.threads):
+        largest = ti.cast(0.0, ti.f64)
+        for j in range(p.team.share(t, p.count[0])):
+            c = p.team.entry(t, j, p.count[0])
             if not _is_flat(o, p.body[c][1]):
                 motion = _motion(p, c, displacement)
                 if n_looks > 0:
@@ -421,4 +456,7 @@ def largest_motion(
                     for e in range(p.first[c], p.first[c] + p.arity[c]):
                         motion -= p.weight[e] * seen[p.node[e]]
                 largest = ti.max(largest, motion.norm())
-    return largest
+        largest = p.team.largest(t, largest)
+        if t == 0:
+            result += largest
+    return result

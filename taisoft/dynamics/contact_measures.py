@@ -137,11 +137,13 @@ def drop_uncertain(
     """Leave out of kept[:n] the contacts whose sides close by more than MAX_CLOSING of the thinner one's thickness in the
     searched step, and move aside by as much before they meet: they may never touch. Passages remain. closing_data: LEFT, the
     number left."""
-    ti.loop_config(serialize=True)
-    for _ in range(1):
+    (team,) = ti.static((s.team,))
+    ti.loop_config(serialize=team.alone, block_dim=team.threads)
+    for t in range(team.threads):
         left = 0
-        for c in range(n):
-            at = kept[c]
+        for j in range(team.rounds(n)):
+            c = t + j * team.threads
+            at = kept[ti.min(c, n - 1)]
             displacement, normal = _relative_displacement(s, o, found, at), found.normal[at]
             closing = -displacement.dot(normal)
             allowed = MAX_CLOSING * ti.min(s.thickness[found.body[at][0]], s.thickness[found.body[at][1]])
@@ -149,10 +151,12 @@ def drop_uncertain(
             if not is_certain:
                 until = ti.min(ti.max(found.gap[at], 0.0) / closing, 1.0)
                 is_certain = until * (displacement + closing * normal).norm() <= allowed
-            if is_certain:
-                kept[left] = at
-                left += 1
-        closing_data[LEFT] = left
+            before, certain = team.count(t, int(is_certain and c < n))
+            if is_certain and c < n:  # no thread reads this far any more
+                kept[left + before] = at
+            left += certain
+        if t == 0:
+            closing_data[LEFT] = left
 
 
 @kernel
@@ -170,11 +174,14 @@ def measure_closing(
     closing_data (6,): deepest penetration [m]; largest closing ratio of a contact (see above); its closing speed [m/s]; its
     number among the kept ones; deepest penetration over the finer side's mean surface edge.
     """
-    ti.loop_config(serialize=True)
-    for _ in range(1):
+    (team,) = ti.static((s.team,))
+    ti.loop_config(serialize=team.alone, block_dim=team.threads)
+    for t in range(team.threads):
         depth, largest_ratio, speed, which = ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64), -1
         relative_penetration = ti.cast(0.0, ti.f64)
-        for c in range(ti.select(n < 0, ti.cast(closing_data[LEFT], ti.i32), n)):
+        size = ti.select(n < 0, ti.cast(closing_data[LEFT], ti.i32), n)
+        for j in range(team.share(t, size)):
+            c = team.entry(t, j, size)
             at = kept[c]
             depth = ti.max(depth, -found.gap[at])
             a, b = found.body[at][0], found.body[at][1]
@@ -184,10 +191,17 @@ def measure_closing(
             allowed = MAX_CLOSING * ti.min(s.thickness[a], s.thickness[b])
             if s.thickness[b] < ti.math.inf and closing > 0.0:
                 ratio = ti.min(closing / allowed, displacement.norm() / ti.max(found.gap[at], allowed))
-                if ratio > largest_ratio:
+                if ratio > largest_ratio or (ratio == largest_ratio and c < which):
                     largest_ratio, speed, which = ratio, closing / dt, c
-        closing_data[DEPTH], closing_data[CLOSING_RATIO], closing_data[SPEED] = depth, largest_ratio, speed
-        closing_data[WHICH], closing_data[RELATIVE_PENETRATION] = which, relative_penetration
+        depth, relative_penetration = team.largest(t, depth), team.largest(t, relative_penetration)
+        overall = team.largest(t, largest_ratio)
+        first = team.least(t, ti.select(which >= 0 and largest_ratio == overall, which, n))  # of several with that ratio
+        if t == 0:
+            closing_data[DEPTH], closing_data[RELATIVE_PENETRATION] = depth, relative_penetration
+            closing_data[CLOSING_RATIO], closing_data[SPEED], closing_data[WHICH] = overall, 0.0, -1.0
+        team.sync()
+        if which == first:
+            closing_data[SPEED], closing_data[WHICH] = speed, which
 
 
 @kernel

@@ -157,11 +157,13 @@ def save_prescribed_positions(m: ti.template(), s: ti.template()):
 
 @ti.func
 def set_loads(m: ti.template(), s: ti.template(), row):
-    """Set the loads that follow paths for this sub-step."""
+    """Set the loads that follow paths for this sub-step, in such loops."""
     if ti.static(s.has_varied_nodes):
+        ti.loop_config(serialize=m.on_cpu)
         for k in range(s.n_varied):
             m.loads[s.varied_nodes[k]] = ti.cast(s.load_rows[row * s.n_varied + k], m.real)
     if ti.static(s.has_varied_amplitudes):
+        ti.loop_config(serialize=m.on_cpu)
         for k in range(s.n_amplitudes):
             m.amplitudes[k] = s.amplitude_rows[row * s.n_amplitudes + k]
 
@@ -214,9 +216,7 @@ def begin_substep(m: ti.template(), s: ti.template(), row, dt, saves, drifts):
         if ti.static(s.has_prescribed):
             prescribe(m, s, row, dt)
     if ti.static(s.has_varied_loads):
-        ti.loop_config(serialize=True)
-        for _ in range(1):
-            set_loads(m, s, row)
+        set_loads(m, s, row)
 
 
 @ti.func

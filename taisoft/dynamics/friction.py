@@ -167,12 +167,13 @@ class Friction:
 
 
 @ti.func
-def _coefficients(contacts: ti.template(), n_remembered):
-    """Return the coefficients (t_1, t_2) of the last two changes."""
+def _coefficients(contacts: ti.template(), t, n_remembered):
+    """Return the coefficients (t_1, t_2) of the last two changes, to thread t of a team."""
     rows, work = ti.static((contacts.problem, contacts.work))
     dot = ti.Vector([0.0, 0.0, 0.0, 0.0, 0.0], ti.f64)  # a.a, a.b, b.b, a.f, b.f
     if n_remembered > 0:
-        for c in range(rows.count[0]):
+        for j in range(rows.team.share(t, rows.count[0])):
+            c = rows.team.term(t, j)
             f, last = rows.r[c] - work.multiplier[c], work.past_change[PAST * c]
             a, b = f - last, dvec(0.0)
             if n_remembered > 1:
@@ -181,6 +182,8 @@ def _coefficients(contacts: ti.template(), n_remembered):
                 factor = rows.factor[c][ti.static(min(i, 1))]
                 if factor > 0.0:
                     dot += ti.Vector([a[i] * a[i], a[i] * b[i], b[i] * b[i], a[i] * f[i], b[i] * f[i]]) / factor
+    for k in ti.static(range(5)):
+        dot[k] = rows.team.total(t, dot[k])
     first, second = ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64)
     determinant = dot[0] * dot[2] - dot[1] * dot[1]
     if determinant > PARALLEL * dot[0] * dot[2]:
@@ -197,10 +200,11 @@ def _coefficients(contacts: ti.template(), n_remembered):
 def extrapolate_multipliers(contacts: ti.template(), n_remembered: ti.i32):
     """Set the multipliers to impulses extrapolated from the last n_remembered updates, 0 to PAST; store this one."""
     rows, work = ti.static((contacts.problem, contacts.work))
-    ti.loop_config(serialize=True)
-    for _ in range(1):
-        first, second = _coefficients(contacts, n_remembered)
-        for c in range(rows.count[0]):
+    ti.loop_config(serialize=rows.team.alone, block_dim=rows.team.threads)
+    for t in range(rows.team.threads):
+        first, second = _coefficients(contacts, t, n_remembered)
+        for j in range(rows.team.share(t, rows.count[0])):
+            c = rows.team.entry(t, j, rows.count[0])
             r, last, last_but_one = rows.r[c], work.past_impulse[PAST * c], work.past_impulse[PAST * c + 1]
             work.past_impulse[PAST * c], work.past_impulse[PAST * c + 1] = r, last
             work.past_change[PAST * c], work.past_change[PAST * c + 1] = r - work.multiplier[c], work.past_change[PAST * c]

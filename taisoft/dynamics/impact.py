@@ -32,7 +32,7 @@ from taisoft.dynamics.newton import Newton, solve
 from taisoft.dynamics.results import StageResult, merge
 from taisoft.dynamics.stage import Stage, impact_jump
 from taisoft.dynamics.stage_system import StageSystem
-from taisoft.fem.chunks import chunk_entry, chunk_size, fold, total
+from taisoft.fem.chunks import chunk_entry, chunk_size, fold, total_by_team
 from taisoft.fem.lanes import mass_times
 from taisoft.fem.state import IMPACT_CURVATURE, IMPACT_SLOPE, N_NORMS, NORMS, OTHER_SUM, SUM
 
@@ -51,18 +51,21 @@ def begin_impact(m: ti.template(), stage: ti.template(), contacts: ti.template()
     for i in range(m.n_nodes):
         m.state.x[i] = contacts.x_start[i] + tau * stage.v_hat[i]
         stage.x_hat[i] = contacts.x_start[i]
-    ti.loop_config(serialize=True)
-    for _ in range(1):
+    ti.loop_config(serialize=rows.team.alone, block_dim=rows.team.threads)
+    for t in range(rows.team.threads):
         speed, mass = ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64)
-        for c in range(rows.count[0]):
+        for j in range(rows.team.share(t, rows.count[0])):
+            c = rows.team.term(t, j)
             rows.impact_impulse[c] = rows.r[c]
             rows.r[c] = dvec(0.0)
             speed = ti.max(speed, rows.min_velocity[c] - rows.approach[c])
-        for i in range(m.n_nodes):
-            mass += ti.cast(m.mass[i], ti.f64) ** 2
-        for j in ti.static(range(N_NORMS)):
-            m.state.scalars[NORMS + j] = 0.0
-        m.state.scalars[NORMS + 1] = mass * speed * speed
+        for j in range(rows.team.share(t, m.n_nodes)):
+            mass += ti.cast(m.mass[rows.team.term(t, j)], ti.f64) ** 2
+        speed, mass = rows.team.largest(t, speed), rows.team.total(t, mass)
+        if t == 0:
+            for j in ti.static(range(N_NORMS)):
+                m.state.scalars[NORMS + j] = 0.0
+            m.state.scalars[NORMS + 1] = mass * speed * speed
 
 
 @kernel
@@ -84,10 +87,12 @@ def measure_impact(m: ti.template(), stage: ti.template(), contacts: ti.template
                 curvature += d.dot(stage.change[i])
             m.state.partial[chunk, SUM], m.state.partial[chunk, OTHER_SUM] = slope, curvature
     fold(m, SUM, OTHER_SUM, ())
-    ti.loop_config(serialize=True)
-    for _ in range(1):
-        slope = total(m, SUM)
-        for c in range(rows.count[0]):
+    ti.loop_config(serialize=rows.team.alone, block_dim=rows.team.threads)
+    for t in range(rows.team.threads):
+        slope, curvature = total_by_team(m, t, SUM), total_by_team(m, t, OTHER_SUM)
+        slope = ti.select(t == 0, slope, 0.0)
+        for j in range(rows.team.share(t, rows.count[0])):
+            c = rows.team.term(t, j)
             u_fixed = -(SPREAD / tau) * rows.obstacle_displacement[c]
             for e in range(rows.first[c], rows.first[c] + rows.arity[c]):
                 i = rows.node[e]
@@ -95,7 +100,9 @@ def measure_impact(m: ti.template(), stage: ti.template(), contacts: ti.template
             slope += to_world(rows, c, rows.r[c]).dot(u_fixed)
             if rows.min_opening[c] > 0.0:
                 slope -= 0.5 * rows.r[c][0] * ti.max(0.0, rows.min_velocity[c] + rows.approach[c])
-        m.state.scalars[IMPACT_SLOPE], m.state.scalars[IMPACT_CURVATURE] = slope, total(m, OTHER_SUM)
+        slope = rows.team.total(t, slope)
+        if t == 0:
+            m.state.scalars[IMPACT_SLOPE], m.state.scalars[IMPACT_CURVATURE] = slope, curvature
 
 
 @kernel
@@ -127,14 +134,19 @@ def rebound_work(contacts: ti.template(), beta: ti.f64) -> ti.f64:
     """Return the work of contacts constrained to their rebound displacement, at the end of the step [J]."""
     rows, work = ti.static((contacts.problem, contacts.work))
     total_work = ti.cast(0.0, ti.f64)
-    ti.loop_config(serialize=True)
-    for _ in range(1):
-        for c in range(rows.count[0]):
+    ti.loop_config(serialize=rows.team.alone, block_dim=rows.team.threads)
+    for t in range(rows.team.threads):
+        own = ti.cast(0.0, ti.f64)
+        for j in range(rows.team.share(t, rows.count[0])):
+            c = rows.team.term(t, j)
             if rows.min_opening[c] > 0.0:
                 displacement = work.tangential_offset[c]
                 for e in range(rows.first[c], rows.first[c] + rows.arity[c]):
                     displacement += rows.weight[e] * contacts.displacement[rows.node[e]]
-                total_work += rows.r[c][0] * rows.normal[c].dot(displacement) / beta
+                own += rows.r[c][0] * rows.normal[c].dot(displacement) / beta
+        own = rows.team.total(t, own)
+        if t == 0:
+            total_work += own
     return total_work
 
 

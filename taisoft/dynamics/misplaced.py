@@ -180,6 +180,82 @@ def _false_work(
     return dvec(r.norm() * ti.max(slip.norm(), contact_offset), false.dot(slip), ti.abs(across.dot(slip)))
 
 
+@ti.func
+def _pair_of(p: ti.template(), n_colliders, c):
+    """The pair of colliders of contact c, as in the sums."""
+    return ti.cast(p.body[c][0] * n_colliders + p.body[c][1], ti.f64)
+
+
+@ti.func
+def _row_of(sums: ti.template(), n_rows, pair, guess):
+    """Row of a pair in the sums, or the unused one where it belongs; n_rows if there is none. guess: looked at first."""
+    row = guess
+    if sums[row, PAIR] != pair:
+        row = 0
+        while row < n_rows and sums[row, PAIR] != pair and sums[row, PAIR] >= 0.0:
+            row += 1
+    return row
+
+
+@ti.func
+def _sum_in_order(p: ti.template(), n_colliders, sums: ti.template(), n_rows):
+    """Add what the contacts add in this step to their rows. Return whether there are enough."""
+    row = 0
+    for c in range(p.count[0]):
+        if p.sweep.sweep_start[c][0] > 0.0 and row < n_rows:
+            pair = _pair_of(p, n_colliders, c)
+            row = _row_of(sums, n_rows, pair, row)  # contacts of a pair mostly follow each other
+            if row < n_rows:
+                sums[row, PAIR] = pair
+                for q in ti.static(range(3)):
+                    sums[row, NOW + q] += p.sweep.sweep_start[c][q]
+                sums[row, IMPULSE] += p.r[c].norm()
+    return row < n_rows
+
+
+@ti.func
+def _find_rows(p: ti.template(), n_colliders, sums: ti.template(), n_rows, t):
+    """Set `renewal.source` of contacts to their rows, n_rows if they have none. Return the first contact whose pair is missing,
+    the number of contacts if none is. For thread t of a team."""
+    first = p.count[0]
+    for j in range(p.team.share(t, p.count[0])):
+        c, row = p.team.entry(t, j, p.count[0]), n_rows
+        if p.sweep.sweep_start[c][0] > 0.0:
+            pair = _pair_of(p, n_colliders, c)
+            row = _row_of(sums, n_rows, pair, 0)
+            if row == n_rows or sums[ti.min(row, n_rows - 1), PAIR] != pair:
+                first = ti.min(first, c)
+        p.renewal.source[c] = row
+    return p.team.least(t, first)
+
+
+@ti.func
+def _sum_by_team(p: ti.template(), n_colliders, sums: ti.template(), n_rows, t):
+    """`_sum_in_order` by thread t of a team: pairs without a row get one in turn, then all threads sum each row."""
+    fits, first = True, _find_rows(p, n_colliders, sums, n_rows, t)
+    while fits and first < p.count[0]:
+        row = p.renewal.source[first]
+        fits = row < n_rows
+        if fits and t == 0:
+            sums[row, PAIR] = _pair_of(p, n_colliders, first)
+        p.team.sync()
+        first = _find_rows(p, n_colliders, sums, n_rows, t)
+    for k in range(ti.select(fits, n_rows, 0)):
+        if sums[k, PAIR] >= 0.0:
+            own = ti.Vector([0.0, 0.0, 0.0, 0.0], ti.f64)
+            for j in range(p.team.share(t, p.count[0])):
+                c = p.team.term(t, j)
+                if p.renewal.source[c] == k:
+                    one = p.sweep.sweep_start[c]
+                    own += ti.Vector([one[0], one[1], one[2], p.r[c].norm()], ti.f64)
+            for q in ti.static(range(4)):
+                own[q] = p.team.total(t, own[q])
+                if t == 0:
+                    sums[k, NOW + q] = own[q]
+    p.team.sync()
+    return fits
+
+
 @kernel(cse=False)
 def add_step(
     p: ti.template(),
@@ -202,44 +278,40 @@ def add_step(
     found passages.
 
     The first number of the last row becomes the row of the pair of the largest misplaced part among those that touch, -1 if none
-    does, -2 without change if there are too few rows. p.sweep.sweep_start is used as workspace.
+    does, -2 without change if there are too few rows. p.sweep.sweep_start
+    and p.renewal.source are used as workspace.
     """
     ti.loop_config(serialize=p.serial)
     for c in range(p.count[0]):
         p.sweep.sweep_start[c] = dvec(0.0)
         if p.r[c][0] > 0.0:
             p.sweep.sweep_start[c] = _false_work(p, m, s, o, overlay, found, has_pairs, c, dt, contact_offset, passes)
-    ti.loop_config(serialize=True)
-    for _ in range(1):
-        worst, row = -1, 0
-        for k in range(n_rows):
+    ti.loop_config(serialize=p.team.alone, block_dim=p.team.threads)
+    for t in range(p.team.threads):
+        for j in range(p.team.share(t, n_rows)):
             for q in ti.static(range(4)):
-                sums[k, NOW + q] = 0.0
-        for c in range(p.count[0]):
-            if p.sweep.sweep_start[c][0] > 0.0 and row < n_rows:
-                own = ti.cast(p.body[c][0] * n_colliders + p.body[c][1], ti.f64)
-                if sums[row, PAIR] != own:  # contacts of a pair mostly follow each other
-                    row = 0
-                    while row < n_rows and sums[row, PAIR] != own and sums[row, PAIR] >= 0.0:
-                        row += 1
-                if row < n_rows:
-                    sums[row, PAIR] = own
-                    for q in ti.static(range(3)):
-                        sums[row, NOW + q] += p.sweep.sweep_start[c][q]
-                    sums[row, IMPULSE] += p.r[c].norm()
-        largest = ti.cast(-1.0, ti.f64)
-        for k in range(ti.select(row < n_rows, n_rows, 0)):
+                sums[p.team.entry(t, j, n_rows), NOW + q] = 0.0
+        p.team.sync()
+        fits = False
+        if ti.static(p.on_cpu):
+            fits = _sum_in_order(p, n_colliders, sums, n_rows)
+        else:
+            fits = _sum_by_team(p, n_colliders, sums, n_rows, t)
+        largest, first = ti.cast(-1.0, ti.f64), n_rows
+        for j in range(p.team.share(t, ti.select(fits, n_rows, 0))):
+            k = p.team.entry(t, j, n_rows)
             own = sums[k, NOW]
             if own > 0.0:
                 for q in range(3):
                     sums[k, q] = FADING * sums[k, q] + sums[k, NOW + q]
                 sums[k, LARGEST] = ti.max(FADING * sums[k, LARGEST], own)
                 part = ti.abs(sums[k, FALSE_WORK]) / ti.max(sums[k, SLIP_WORK], MIN_STEPS * sums[k, LARGEST])
-                if part > largest:
-                    worst, largest = k, part
-        if row == n_rows:
-            worst = -2
-        sums[n_rows, 0] = worst
+                if part > largest or (part == largest and k < first):
+                    first, largest = k, part
+        overall = p.team.largest(t, largest)
+        first = p.team.least(t, ti.select(largest == overall, first, n_rows))
+        if t == 0:
+            sums[n_rows, 0] = ti.select(fits, ti.select(first < n_rows, first, -1), -2)
 
 
 class Misplacement:

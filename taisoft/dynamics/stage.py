@@ -15,7 +15,7 @@ from taisoft.backend.arrays import Count
 from taisoft.backend.runtime import kernel
 from taisoft.contact.problem import ContactProblem
 from taisoft.dynamics.contact_terms import impulse_on_node
-from taisoft.fem.chunks import chunk_entry, chunk_size, fold, total
+from taisoft.fem.chunks import chunk_entry, chunk_size, fold, total_by_team
 from taisoft.fem.dependents import force_with_dependents, is_dependent
 from taisoft.fem.lanes import mass_times
 from taisoft.fem.state import END_SLOPE, N_NORMS, NORMS, OTHER_SUM, START_SLOPE, SUM
@@ -104,7 +104,7 @@ def begin_stage(m: ti.template(), stage: ti.template(), beta: ti.f64, prescribed
     for i in range(m.n_nodes):
         m.state.x[i] = stage.x_hat[i] + beta * m.state.v[i]
     if ti.static(stage.has_prescribed):
-        ti.loop_config(serialize=True)
+        ti.loop_config(serialize=m.on_cpu)
         for k in range(stage.n_prescribed):
             i = stage.prescribed_nodes[k]
             for a in ti.static(range(3)):
@@ -275,10 +275,10 @@ def move(
     fold(m, OTHER_SUM, OTHER_SUM, ())
     if ti.static(kind == ELASTIC_STAGE):
         elasticity.sum_elements(m)
-    ti.loop_config(serialize=True)
-    for _ in range(1):
+    ti.loop_config(serialize=m.team.alone, block_dim=m.team.threads)
+    for t in range(m.team.threads):
         if mode == STEP:
-            m.state.scalars[START_SLOPE] = total(m, OTHER_SUM)
+            m.state.scalars[START_SLOPE] = total_by_team(m, t, OTHER_SUM)
 
 
 @kernel
@@ -317,8 +317,8 @@ def form_residual(
                 m.state.partial[chunk, j] = sums[j]
             m.state.partial[chunk, SUM] = slope
     fold(m, 0, SUM, ())
-    ti.loop_config(serialize=True)  # outside of any loop, the sum would become a parallel loop of its own, 50 us and more
-    for _ in range(1):
+    ti.loop_config(serialize=m.team.alone, block_dim=m.team.threads)
+    for t in range(m.team.threads):
         for j in ti.static(range(N_NORMS) if kind == ELASTIC_STAGE else (0, 4)):
-            m.state.scalars[NORMS + j] = total(m, j)
-        m.state.scalars[END_SLOPE] = total(m, SUM)
+            m.state.scalars[NORMS + j] = total_by_team(m, t, j)
+        m.state.scalars[END_SLOPE] = total_by_team(m, t, SUM)

@@ -15,6 +15,7 @@ from taisoft.backend import parallel
 from taisoft.backend.arrays import FieldArena
 from taisoft.backend.paths import gpu_threads
 from taisoft.backend.runtime import Runtime
+from taisoft.backend.team import make_team
 from taisoft.fem import dependents, elements, fibres, loads, masses, mean_dilatation, pressure, rigid_tets, springs, viscosity
 from taisoft.fem.model import Group, Layout, Model, Setup
 from taisoft.fem.pattern import model_graph
@@ -50,6 +51,7 @@ def build_model(scene: Scene, runtime: Runtime, arena: FieldArena, on: dict[str,
         real=runtime.real,
         lanes=runtime.lanes,
         on_cpu=runtime.on_cpu,
+        team=make_team(arena, "model"),
         n_nodes=n_nodes,
         state=state,
         terms=terms_of(setup.on),

@@ -87,6 +87,15 @@ def fold(m: ti.template(), first: ti.template(), last: ti.template(), least: ti.
 
 
 @ti.func
+def total_by_team(m: ti.template(), t, column: ti.template()):
+    """`total`, for thread t of the model's team: the same number for all threads."""
+    s = ti.cast(0.0, ti.f64)
+    for j in range(m.team.share(t, m.sums)):
+        s += m.state.partial[m.team.term(t, j), column]
+    return m.team.total(t, s)
+
+
+@ti.func
 def total(m: ti.template(), column: ti.template()):
     """Sum of a column of the model's partial sums, in a fixed order, after `fold`."""
     s = ti.cast(0.0, ti.f64)

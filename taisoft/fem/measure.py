@@ -3,7 +3,7 @@
 import taichi as ti
 
 from taisoft.backend.runtime import kernel
-from taisoft.fem.chunks import chunk_entry, chunk_size, fold
+from taisoft.fem.chunks import chunk_entry, chunk_size, fold, total_by_team
 from taisoft.fem.lanes import broadcast, mass_times
 from taisoft.fem.mean_dilatation import find_dilatations
 from taisoft.fem.state import ELASTIC, FIRST_SOFTENED, GRAVITY, KINETIC, LOADS, MIN_J, N_INVERTED
@@ -78,21 +78,25 @@ def measure(m: ti.template()):
             m.state.partial[c, KINETIC], m.state.partial[c, GRAVITY], m.state.partial[c, LOADS] = kinetic, weight, loads
             m.state.partial[c, FIRST_SOFTENED] = ti.cast(softened.min(), ti.f64)
     fold(m, ELASTIC, LOADS, LEAST)
-    ti.loop_config(serialize=True)
-    for _ in range(1):
+    ti.loop_config(serialize=m.team.alone, block_dim=m.team.threads)
+    for t in range(m.team.threads):
         for k in ti.static(SCALARS):
-            total = m.state.partial[0, k]
-            for c in range(1, m.sums):
-                value = m.state.partial[c, k]
-                if ti.static(k in LEAST):
-                    total = ti.min(total, value)
-                else:
-                    total += value
-            m.state.scalars[k] = total
+            result = ti.cast(0.0, ti.f64)
+            if ti.static(k in LEAST):
+                least = m.state.partial[0, k]
+                for j in range(m.team.share(t, m.sums)):
+                    least = ti.min(least, m.state.partial[m.team.term(t, j), k])
+                result = -m.team.largest(t, -least)
+            else:
+                result = total_by_team(m, t, k)
+            if t == 0:
+                m.state.scalars[k] = result
         if ti.static(m.has_springs):
             elastic, potential = ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64)
-            for line in range(m.springs.n_lines):
-                elastic += springs.elastic_energy(m, line)
-                potential += springs.load_energy(m, line)
-            m.state.scalars[ELASTIC] = m.state.scalars[ELASTIC] + elastic
-            m.state.scalars[LOADS] = m.state.scalars[LOADS] + potential
+            for j in range(m.team.share(t, m.springs.n_lines)):
+                elastic += springs.elastic_energy(m, m.team.term(t, j))
+                potential += springs.load_energy(m, m.team.term(t, j))
+            elastic, potential = m.team.total(t, elastic), m.team.total(t, potential)
+            if t == 0:
+                m.state.scalars[ELASTIC] = m.state.scalars[ELASTIC] + elastic
+                m.state.scalars[LOADS] = m.state.scalars[LOADS] + potential

@@ -13,6 +13,7 @@ import numpy as np
 from taisoft.backend.arrays import Count, FieldArena
 from taisoft.backend.lists import spread_on
 from taisoft.backend.runtime import Runtime
+from taisoft.backend.team import Team
 from taisoft.fem.chunks import FOLDED, SweepOrder
 from taisoft.fem.dependent_table import DependentTable
 from taisoft.fem.spring_table import SpringTable
@@ -95,6 +96,7 @@ class Model:
     fibres: Any = None  # fem.fibres.FibreTable
     viscosity: Any = None  # fem.viscosity.Viscosity
     elasticity_by_tet: bool  # law_constants may differ between the tets of a body
+    team: Team  # of loops over sums and springs
     chunks: int  # of a loop, each with its own partial sums
 
     @property

@@ -96,7 +96,7 @@ def green_strain(F):
 @kernel
 def begin_rigid_stage(m: ti.template(), h: ti.template(), multistep: ti.template(), now: ti.f64, before: ti.f64, beta: ti.f64):
     """Set E_hat = now E(x_n) - before E(x_(n-1)) and 1/beta of a stage. h: history."""
-    ti.loop_config(serialize=True)
+    ti.loop_config(serialize=m.on_cpu)
     for k in range(m.rigid_tets.n):
         E = now * green_strain(gradient_of(m, h.x_now, k))
         if ti.static(multistep):

@@ -13,7 +13,9 @@ import pytest
 import taichi as ti
 
 from taisoft.backend.arrays import FieldArena
+from taisoft.backend.paths import Order
 from taisoft.backend.runtime import kernel
+from taisoft.backend.team import Team
 from taisoft.collision.bvh import DIRECTIONS, Bvh
 from taisoft.collision.candidates import EDGES, WHOLE, Buffer, entries, pair_entries
 from taisoft.collision.spatial_hash import N_LARGE, SpatialHash
@@ -44,11 +46,11 @@ def rig():
             arenas.append(FieldArena())
             return arenas[-1]
 
-        made.x0, made.new_arena, s = made.x, arena, made.surface
-        made.new_tree = lambda **options: Bvh(s, made.topology, made.x0, made.margin, made.runtime, arena(), **options)
+        made.x0, made.new_arena = made.x, arena
+        made.new_tree = lambda **options: Bvh(made.surface, made.topology, made.x0, made.margin, made.runtime, arena(), **options)
         made.trees = {k: made.new_tree(k_dop=k, leaves=5) for k in DIRECTIONS}
-        made.hash = SpatialHash(s, arena(), 0.1, np.ones(3), capacity=2**17)
-        made.one_cell = SpatialHash(s, arena(), 0.1, np.zeros(3), capacity=2**17)
+        made.hash = SpatialHash(made.surface, arena(), 0.1, np.ones(3), capacity=2**17)
+        made.one_cell = SpatialHash(made.surface, arena(), 0.1, np.zeros(3), capacity=2**17)
         yield made
         for part in (*made.trees.values(), made.hash, made.one_cell, *arenas):
             part.release()
@@ -72,17 +74,22 @@ def test_candidates_are_those_of_brute_force(rig):
     assert total > 10000 and large > 1
 
 
-def test_chunks_levels_and_loops_as_on_cuda_change_nothing(rig):
+@pytest.mark.parametrize("order", [Order(), Order(7), Order(64, True)])
+def test_chunks_and_loops_as_on_cuda_change_nothing(rig, order):
     scatter(np.random.default_rng(5), rig, 0)
     expected, s = brute_pairs(rig), rig.surface
-    for leaves, by_levels in ((1, False), (10**6, False), (2, True)):
+    before = [f.to_numpy() for f in (s.body_lo, s.body_hi, s.active, s.count)]
+    rig.surface = replace(s, on_cpu=False, team=Team(*order))
+    for leaves in (1, 10**6, 2):
         tree = rig.new_tree(leaves=leaves)
-        tree.by_levels = by_levels
         assert np.array_equal(found(rig, tree), expected)
         tree.release()
-    before = [f.to_numpy() for f in (s.body_lo, s.body_hi, s.active, s.count)]
-    update_boxes(replace(s, on_cpu=False), rig.margin)
+    grid = SpatialHash(rig.surface, rig.new_arena(), 0.1, np.ones(3), capacity=64)
+    assert np.array_equal(row_pairs(grid.near()), expected) and all(buffer.growths for buffer in grid.buffers)
+    grid.release()
+    update_boxes(rig.surface, rig.margin)
     assert all(np.array_equal(f.to_numpy(), b) for f, b in zip((s.body_lo, s.body_hi, s.active, s.count), before))
+    rig.surface = s
 
 
 @pytest.mark.parametrize("kind", ["pairs", "hash"])
