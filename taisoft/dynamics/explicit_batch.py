@@ -124,6 +124,7 @@ class Batch:
             if self.event != NOTHING:
                 run_on(detection.surface)
             counts = (int(self.tally[k]) for k in (FOUND_BEFORE, FOUND_LAST, KEPT_LAST))
+            contact.far.skip(int(self.tally[DONE]) - 1)
             contact.end_batch(time + self.tally[DONE] * dt, dt, *counts, self.event == NOTHING)
 
     def launch(self, k: int, time: float, dt: float, good: StepState, max_sweeps: int) -> None:

@@ -59,6 +59,10 @@ class FarApart:
         self._pause = max(self._pause - 1, 0)
         return self._pause == 0
 
+    def skip(self, n: int) -> None:
+        """Count n sub-steps that have not asked."""
+        self._pause = max(self._pause - n, 0)
+
     def search(self, time: float, dt: float) -> None:
         """Search from a time [s] for as many sub-steps of dt as nothing can touch in, instead of the detection's last search."""
         self.forget()
