@@ -51,7 +51,9 @@ OF = {  # of packages, modules and functions of taisoft; the longest name that f
     **{f"dynamics.{name}": FRICTION for name in ("contact_terms", "friction", "impact", "linearised")},
     "dynamics.contact_terms.save_diagonal": FORCES,
     **{f"dynamics.{name}": FORCES for name in ("explicit", "explicit_contact", "implicit_stages", "joints", "stage", "state")},
-    **{f"dynamics.{name}": OTHER for name in ("contact_geometry", "contact_measures", "far_apart", "misplaced")},
+    "dynamics.explicit_contact.begin_solve": FRICTION,
+    **{f"dynamics.{name}": OTHER for name in ("contact_geometry", "contact_measures", "explicit_batch", "far_apart", "misplaced")},
+    "backend.reader": OTHER,
     "dynamics.contact_measures.find_displacement": PATHS,
 }
 PLACES = (  # the search's own part, and what does dense algebra

@@ -104,11 +104,11 @@ def verlet_drift(m: ti.template(), s: ti.template(), i, dt, half):
 
 @ti.func
 def verlet_kick(m: ti.template(), s: ti.template(), i, dt, decay):
-    """Apply the second half kick and return v. decay: as in `verlet_half`."""
+    """Apply the second half kick and return v. decay: as in `verlet_half`. dt: 0 to set the acceleration alone."""
     a = acceleration(m, i)
     half = m.state.v[i]
     if ti.static(m.depends_on_velocity):
-        half = s.half_velocity[i]
+        half = ti.select(dt > 0.0, s.half_velocity[i], half)
     v = half + 0.5 * dt * ti.cast(a, ti.f64)
     if ti.static(m.damped):
         v *= decay

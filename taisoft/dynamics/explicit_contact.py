@@ -110,9 +110,9 @@ def begin_solve(
 def _close_substep(m: ti.template(), work: ti.template(), p: ti.template(), s: ti.template(), dt, event):
     """Compute the reactions, and update the counter MOST_INVERTED. Top-level loops of a kernel."""
     if ti.static(work.has_held):
-        compute_reactions(m, work, dt, s.run[GO] * work.n_held)
+        compute_reactions(m, work, dt, int(dt > 0.0) * s.run[GO] * work.n_held)
         ti.loop_config(serialize=m.on_cpu)
-        for k in range(s.run[GO] * int(p.count[0] > 0) * work.n_held):  # without the forces of contacts
+        for k in range(int(dt > 0.0 and p.count[0] > 0) * s.run[GO] * work.n_held):  # without the forces of contacts
             i = work.held[k]
             work.reaction[k] -= (1.0 - m.free[i]) * ti.cast(impulse_on(p, i) / dt, m.real)
     ti.loop_config(serialize=True)
@@ -151,7 +151,10 @@ def move(m: ti.template(), work: ti.template(), p: ti.template(), s: ti.template
 
 @kernel
 def finish_verlet(m: ti.template(), work: ti.template(), p: ti.template(), s: ti.template(), dt: ti.f64, event: ti.i32):
-    """Apply the second half kick by the forces at the new positions; scalars as in `predict` and `move`."""
+    """Apply the second half kick by the forces at the new positions; scalars as in `predict` and `move`.
+
+    dt: 0 to compute the acceleration alone.
+    """
     elasticity.sum_elements_with_damping(m, s.run[GO])
     ti.loop_config(serialize=m.serial)
     for i in range(s.run[GO] * m.n_nodes):

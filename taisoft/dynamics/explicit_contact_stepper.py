@@ -149,8 +149,7 @@ class ContactExplicitStepper(ExplicitStepper):
         model, work = self.simulation.model, self.work
         self.simulation.set_load_time(time)
         if work.verlet and self.acceleration_stale:
-            explicit.run_elements(model)
-            explicit.find_acceleration(model, work)
+            finish_verlet(model, work, self.contact.problem, self.contact.detection.surface, 0.0, NOTHING)
         self.acceleration_stale = False
 
     def _substep(self, step: int, time: float, dt: float, is_far: bool, event: int) -> SolveResult | None:
