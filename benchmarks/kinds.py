@@ -52,7 +52,8 @@ OF = {  # of packages, modules and functions of taisoft; the longest name that f
     "dynamics.contact_terms.save_diagonal": FORCES,
     **{f"dynamics.{name}": FORCES for name in ("explicit", "explicit_contact", "implicit_stages", "joints", "stage", "state")},
     "dynamics.explicit_contact.begin_solve": FRICTION,
-    **{f"dynamics.{name}": OTHER for name in ("contact_geometry", "contact_measures", "explicit_batch", "far_apart", "misplaced")},
+    **{f"dynamics.{name}": OTHER for name in ("contact_geometry", "contact_measures", "far_apart", "misplaced")},
+    "dynamics.explicit_batch": OTHER,
     "backend.reader": OTHER,
     "dynamics.contact_measures.find_displacement": PATHS,
 }
