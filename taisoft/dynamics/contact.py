@@ -151,7 +151,7 @@ class ContactStep:
     @property
     def n_contacts(self) -> int:
         """Contacts of the last step, including those without impulse, but not those of sleeping bodies."""
-        if self._explicit or self._n_contacts is None:
+        if self._n_contacts is None:
             self._n_contacts = int(self.problem.count[0])
         return self._n_contacts
 
@@ -320,16 +320,16 @@ class ContactStep:
         """Prepare for sub-steps that the host does not follow, after a search."""
         self.gap_targets = self._gap_targets()
 
-    def end_batch(self, time: float, dt: float, found_before: int, found: int, kept: int, is_whole: bool) -> None:
+    def end_batch(self, time: float, dt: float, n: int, found_before: int, found: int, kept: int, is_whole: bool) -> None:
         """Take over after sub-steps of dt [s] that the host has not followed; time: after those that were accepted.
 
-        found_before, found, kept: contacts of the search before the last one, and of the last one. is_whole: whether the next
-        sub-step has not begun.
+        n: contacts in the last of these; found_before, found, kept: those of the search before the last one, and of the last one.
+        is_whole: whether the next sub-step has not begun.
         """
         self.detection.adopt(found, kept)
         self.measures.begin(dt)
         self._searched, self._measured_end = (time, dt), None
-        self._search_counts = (found_before if is_whole else found, 0)
+        self._n_contacts, self._search_counts = (n, (found_before, 0)) if is_whole else (kept, (found, 0))
         self._last_time, self._impulse_fraction, self.had_impact, self._indexed = dt, 1.0, False, True
         self._renewal.sides, self._renewal.n_looks = None, 0
         self.measure_crossings()
@@ -381,7 +381,8 @@ class ContactStep:
         self.relative_penetration = 0.0
         if not self.is_far(time, dt):
             self.search(time, dt)
-            self.relative_penetration = max(float(self.measures.closing[RELATIVE_PENETRATION]), self.initial_crossing())
+            if not (self._explicit and self.crossing is not None and self.paths.none_cross):  # where it limits nothing
+                self.relative_penetration = max(float(self.measures.closing[RELATIVE_PENETRATION]), self.initial_crossing())
         self._deepest, self._most_crossed = DEEP_PENETRATION, CROSSED
         self._raise_limits()
         self._substep_fraction, self._step_dt, self.dropped = 1.0, dt, 0

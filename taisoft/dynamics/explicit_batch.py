@@ -26,8 +26,9 @@ from taisoft.fem.state import EVENT, GO
 MOST = 32  # sub-steps of a batch
 NOTHING, NOT_SOLVED, FAULT, NOT_FREE, NOT_FOUND = range(5)  # events, in the order in which a sub-step may meet them
 # Indices into the tally: sub-steps accepted, sweeps in them, largest residual, solves that did not converge, deepest penetration
-# [m], and over the finer side's edge; contacts found by the search before the last one and by the last one, and those kept
-DONE, ALL_SWEEPS, WORST, UNSOLVED, DEEPEST, DEEPEST_RELATIVE, FOUND_BEFORE, FOUND_LAST, KEPT_LAST, N_TALLY = range(10)
+# [m], and over the finer side's edge; contacts in the last one; found by the search before the last one and by the last one, and
+# those kept
+DONE, ALL_SWEEPS, WORST, UNSOLVED, DEEPEST, DEEPEST_RELATIVE, CONTACTS, FOUND_BEFORE, FOUND_LAST, KEPT_LAST, N_TALLY = range(11)
 
 
 @kernel
@@ -80,6 +81,7 @@ def accept(
         depth, relative = p.team.largest(t, depth), p.team.largest(t, relative)
         if t == 0 and s.run[GO] == 1:
             tally[DONE] += 1.0
+            tally[CONTACTS] = p.count[0]
             if p.count[0] > 0:
                 residual = p.sweep.state[RESIDUAL]
                 tally[ALL_SWEEPS] += p.sweep.state[SWEEPS]
@@ -120,10 +122,11 @@ class Batch:
             for k in range(n):
                 self.launch(k, time + k * dt, dt, good, max_sweeps)
         finally:  # Ctrl-C, too
-            self.tally, self.event = self._tally.to_numpy(), int(detection.surface.run[EVENT])
+            self.tally = self._tally.to_numpy()
+            self.event = NOTHING if self.tally[DONE] == n else int(detection.surface.run[EVENT])
             if self.event != NOTHING:
                 run_on(detection.surface)
-            counts = (int(self.tally[k]) for k in (FOUND_BEFORE, FOUND_LAST, KEPT_LAST))
+            counts = (int(self.tally[k]) for k in (CONTACTS, FOUND_BEFORE, FOUND_LAST, KEPT_LAST))
             contact.far.skip(int(self.tally[DONE]) - 1)
             contact.end_batch(time + self.tally[DONE] * dt, dt, *counts, self.event == NOTHING)
 
