@@ -59,6 +59,8 @@ class Reader:
         ends = np.cumsum(sizes).tolist()
         key = tuple(id(array) for array in arrays)
         if key not in self._kept:
+            if ends[-1] > ROOM:
+                raise ValueError(f"{ends[-1]} numbers are to be read together, and there is room for {ROOM}")
             parts = tuple(_Part(array, end - n, n) for array, end, n in zip(arrays, ends, sizes))
             self._kept[key] = _Parts(parts, self._gathered)
         gather(self._kept[key])

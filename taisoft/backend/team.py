@@ -89,20 +89,6 @@ class Team:
         return self._folded(t, value, True)
 
     @ti.func
-    def before(self, t, value):
-        """Return the sum of an f64 value over the threads before t."""
-        result = ti.cast(0.0, ti.f64)
-        if ti.static(not self.alone):
-            self._store(t, value, False)
-            size = ti.static(self.threads // FOLD)
-            for k in range(t // size):
-                result += self.sums[self.threads + k]
-            for k in range(t - t % size, t):
-                result += self.sums[k]
-            self.sync()
-        return result
-
-    @ti.func
     def rounds(self, n):
         """Return how many rounds the threads need for n entries if each takes one in every round."""
         return (n + self.threads - 1) // self.threads
@@ -110,8 +96,18 @@ class Team:
     @ti.func
     def count(self, t, number):
         """Return the sums of an i32 number over the threads before t, and over all threads."""
-        value = ti.cast(number, ti.f64)
-        return ti.cast(self.before(t, value), ti.i32), ti.cast(self.total(t, value), ti.i32)
+        before, total = 0, number
+        if ti.static(not self.alone):
+            self._store(t, ti.cast(number, ti.f64), False)
+            size = ti.static(self.threads // FOLD)
+            sum_before = ti.cast(0.0, ti.f64)
+            for k in range(t // size):
+                sum_before += self.sums[self.threads + k]
+            for k in range(t - t % size, t):
+                sum_before += self.sums[k]
+            before, total = ti.cast(sum_before, ti.i32), ti.cast(self._fold(self.threads, FOLD, False), ti.i32)
+            self.sync()
+        return before, total
 
     @ti.func
     def add_up(self, t, numbers: ti.template(), n):

@@ -188,7 +188,7 @@ def _list_kept(work: ti.template(), t):
     if ti.static(not work.team.alone):
         for i in range(first, last):
             n += int(work.state[work.place[i]] == KEPT)
-        n = ti.cast(work.team.before(t, ti.cast(n, ti.f64)), ti.i32)
+        n, _total = work.team.count(t, n)
     for i in range(first, last):
         if work.state[work.place[i]] == KEPT:
             work.kept[n] = work.place[i]

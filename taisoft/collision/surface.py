@@ -44,7 +44,7 @@ class Surface:
     serial_cheap: bool  # whether one thread runs the cheap loops
     on_cpu: bool
     chunks: int
-    spread: int  # loop iterations per chunk, see SPREAD
+    spread: int  # loop iterations per chunk, see `backend.lists`
     cheap_spread: int  # the same for cheap loops
     team: Team  # of loops over chunks
     triangle: Any

@@ -276,7 +276,7 @@ class ContactStep:
         if not far.covers(time + dt):
             if not self._explicit or self.n_contacts or counts.active or counts.found or not now.none_cross or self.has_paths:
                 return False
-            if not far.is_due() or (self.detection.only_shapes and not self.simulation.model.on_cpu):  # batches take them
+            if not far.is_due():
                 return False
             self._searched = None
             far.search(time, dt)
@@ -317,8 +317,10 @@ class ContactStep:
         return dt / self._last_time if self._last_time > 0.0 else 0.0
 
     def begin_batch(self) -> None:
-        """Prepare for sub-steps that the host does not follow, after a search."""
-        self.gap_targets = self._gap_targets()
+        """Prepare for sub-steps that the host does not follow, after a search: there must be room for its contacts."""
+        self.gap_targets, n = self._gap_targets(), self.detection.counts.contacts
+        if room := self._room(n, most_entries(self.simulation.model, n, 0)):
+            self._allocate(*room)
 
     def end_batch(self, time: float, dt: float, n: int, found_before: int, found: int, kept: int, is_whole: bool) -> None:
         """Take over after sub-steps of dt [s] that the host has not followed; time: after those that were accepted.
@@ -376,10 +378,10 @@ class ContactStep:
         self.had_impact = self.had_impact or found
         return found
 
-    def start_step(self, time: float, dt: float) -> None:
-        """Begin a step of dt from a time. Penetration that exists there is not new."""
+    def start_step(self, time: float, dt: float, may_be_far: bool = True) -> None:
+        """Begin a step of dt from a time. Penetration that exists there is not new. may_be_far: whether to ask `is_far`."""
         self.relative_penetration = 0.0
-        if not self.is_far(time, dt):
+        if not (may_be_far and self.is_far(time, dt)):
             self.search(time, dt)
             if not (self._explicit and self.crossing is not None and self.paths.none_cross):  # where it limits nothing
                 self.relative_penetration = max(float(self.measures.closing[RELATIVE_PENETRATION]), self.initial_crossing())

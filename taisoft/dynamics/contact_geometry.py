@@ -333,13 +333,16 @@ def judge(
             if is_gone and pushes:
                 changed |= 1
                 if b >= 0:
-                    p.renewal.heir[c] = b
-                    ti.atomic_min(p.renewal.giver[b], c)
-    ti.loop_config(serialize=p.serial)
-    for b in range(n):
-        for c in range(p.renewal.giver[b], p.count[0]):
-            if p.renewal.heir[c] == b:
-                p.renewal.inherited[b] = p.renewal.inherited[b] + p.past.impulse[c]
+                    if ti.static(p.on_cpu):
+                        p.renewal.inherited[b] = p.renewal.inherited[b] + p.past.impulse[c]
+                    else:
+                        p.renewal.heir[c] = b
+                        ti.atomic_min(p.renewal.giver[b], c)
+    if ti.static(not p.on_cpu):  # in the same order
+        for b in range(n):
+            for c in range(p.renewal.giver[b], p.count[0]):
+                if p.renewal.heir[c] == b:
+                    p.renewal.inherited[b] = p.renewal.inherited[b] + p.past.impulse[c]
     return changed
 
 

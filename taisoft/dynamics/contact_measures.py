@@ -195,7 +195,7 @@ def measure_closing(
                     largest_ratio, speed, which = ratio, closing / dt, c
         depth, relative_penetration = team.largest(t, depth), team.largest(t, relative_penetration)
         overall = team.largest(t, largest_ratio)
-        first = team.least(t, ti.select(which >= 0 and largest_ratio == overall, which, n))  # of several with that ratio
+        first = team.least(t, ti.select(which >= 0 and largest_ratio == overall, which, size))  # of several with that ratio
         if t == 0:
             closing_data[DEPTH], closing_data[RELATIVE_PENETRATION] = depth, relative_penetration
             closing_data[CLOSING_RATIO], closing_data[SPEED], closing_data[WHICH] = overall, 0.0, -1.0

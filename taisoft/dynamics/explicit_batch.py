@@ -17,6 +17,7 @@ from taisoft.contact.build import NODES, fill, finish_contacts
 from taisoft.contact.problem import RESIDUAL, SWEEPS
 from taisoft.contact.solve import MOST_OF_TEAM, sweeps_per_launch, team_of
 from taisoft.dynamics.contact import ContactStep
+from taisoft.dynamics.explicit import reset_counters
 from taisoft.dynamics.explicit_contact import begin_solve, finish_verlet, move, predict
 from taisoft.dynamics.explicit_stepper import SubstepWork
 from taisoft.dynamics.simulation_state import SimulationState
@@ -44,8 +45,17 @@ def begin_tally(s: ti.template(), tally: ti.template(), found: ti.i32, kept: ti.
 
 
 @kernel
+def begin_advance(m: ti.template(), s: ti.template()):
+    """Reset the counters, and let kernels work, also after a batch that has ended early."""
+    ti.loop_config(serialize=True)
+    for _ in range(1):
+        reset_counters(m)
+        s.run[GO] = 1
+
+
+@kernel
 def run_on(s: ti.template()):
-    """Let kernels work again after the end of a batch."""
+    """Let kernels work again after a batch that has ended early."""
     ti.loop_config(serialize=True)
     for _ in range(1):
         s.run[GO] = 1
@@ -107,28 +117,40 @@ class Batch:
     def suits(self) -> bool:
         """Return whether the next sub-steps may be a batch."""
         simulation, contact = self._simulation, self._contact
-        knows = simulation.now.none_cross and not len(simulation.now.held.pairs) and not contact.has_paths
-        return self._suits and knows and not simulation.loads.vary and contact.detection.counts.contacts <= MOST_OF_TEAM
+        is_free = simulation.now.none_cross and not len(simulation.now.held.pairs) and not contact.has_paths
+        return self._suits and is_free and not simulation.loads.vary and contact.detection.counts.contacts <= MOST_OF_TEAM
 
     def run(self, n: int, time: float, dt: float, good: StepState, max_sweeps: int) -> None:
         """Take up to n sub-steps of dt [s], after a search at their time.
 
-        good: the state at the start, which becomes that after the last sub-step accepted. The tally is read in any case.
+        good: the state at the start, which becomes that after the last sub-step accepted. The tally is right after Ctrl-C, too.
         """
         contact, detection = self._contact, self._contact.detection
+        self.tally, self.event = np.zeros(N_TALLY), NOTHING
         contact.begin_batch()
         begin_tally(detection.surface, self._tally, detection.counts.found, detection.counts.contacts)
         try:
             for k in range(n):
                 self.launch(k, time + k * dt, dt, good, max_sweeps)
-        finally:  # Ctrl-C, too
-            self.tally = self._tally.to_numpy()
-            self.event = NOTHING if self.tally[DONE] == n else int(detection.surface.run[EVENT])
-            if self.event != NOTHING:
-                run_on(detection.surface)
+        finally:
+            interrupt = self._read(n)
+            contact.far.skip(int(self.tally[DONE]) - int(self.event == NOTHING))
             counts = (int(self.tally[k]) for k in (CONTACTS, FOUND_BEFORE, FOUND_LAST, KEPT_LAST))
-            contact.far.skip(int(self.tally[DONE]) - 1)
             contact.end_batch(time + self.tally[DONE] * dt, dt, *counts, self.event == NOTHING)
+        if interrupt is not None:
+            raise interrupt
+
+    def _read(self, n: int) -> KeyboardInterrupt | None:
+        """Read how a batch of n sub-steps has ended; again after Ctrl-C, which is returned: the good state is the tally's."""
+        interrupt = None
+        while True:
+            try:
+                tally = self._tally.to_numpy()
+                event = NOTHING if tally[DONE] == n else int(self._contact.detection.surface.run[EVENT])
+                self.tally, self.event = tally, event
+                return interrupt
+            except KeyboardInterrupt as error:
+                interrupt = error
 
     def launch(self, k: int, time: float, dt: float, good: StepState, max_sweeps: int) -> None:
         """Launch sub-step k of the batch."""

@@ -20,7 +20,7 @@ from taisoft.dynamics.contact_terms import (
     update_contact,
 )
 from taisoft.dynamics.stage import norm_weight, place_node
-from taisoft.fem.chunks import chunk_entry, chunk_size, fold, total
+from taisoft.fem.chunks import chunk_entry, chunk_size, fold, total_by_team
 from taisoft.fem.state import LINEAR_COUNT, LINEAR_STATUS, NORMS, OTHER_SUM, STEP_LENGTH, SUM
 from taisoft.linear.block_csr import block_times, off_diagonal_times
 from taisoft.linear.pcg_work import COUNT, NEGATIVE, RUNNING, STATUS, dot64
@@ -104,7 +104,7 @@ def _find_step_length(m: ti.template(), stage: ti.template(), contacts: ti.templ
     0 unless a team's linear solve has ended without negative curvature: the host has not looked yet.
     """
     rows, work = ti.static((contacts.problem, contacts.work))
-    start = total(m, SUM)
+    start = total_by_team(m, t, SUM)
     linear_slope = start
     if t > 0:
         linear_slope = 0.0
@@ -112,7 +112,7 @@ def _find_step_length(m: ti.template(), stage: ti.template(), contacts: ti.templ
         c = rows.team.term(t, j)
         linear_slope += work.rate[c].dot(rows.r[c])
     linear_slope = rows.team.total(t, linear_slope)
-    length = _root(contacts, linear_slope, total(m, OTHER_SUM), start, r_scale, t)
+    length = _root(contacts, linear_slope, total_by_team(m, t, OTHER_SUM), start, r_scale, t)
     if t == 0:
         m.state.scalars[STEP_LENGTH] = length
         if ti.static(stage.pcg.by_team):
@@ -174,9 +174,11 @@ def _find_residual(m: ti.template(), stage: ti.template(), contacts: ti.template
                 square += _node_residual(m, stage, contacts, chunk_entry(m, chunk, j, m.n_nodes))
             m.state.partial[chunk, SUM] = square
     fold(m, SUM, SUM, ())
-    ti.loop_config(serialize=True)
-    for _ in range(1):
-        m.state.scalars[NORMS] = total(m, SUM)
+    ti.loop_config(serialize=m.team.alone, block_dim=m.team.threads)
+    for t in range(m.team.threads):
+        norm = total_by_team(m, t, SUM)
+        if t == 0:
+            m.state.scalars[NORMS] = norm
 
 
 @kernel

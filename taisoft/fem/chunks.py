@@ -69,7 +69,7 @@ def chunk_entry(m: ti.template(), c, k, n):
 
 @ti.func
 def fold(m: ti.template(), first: ti.template(), last: ti.template(), least: ti.template()):
-    """Prepare `total` of columns first to last, as a top-level loop of a kernel: nothing on the CPU.
+    """Prepare `total_by_team` of columns first to last, as a top-level loop of a kernel: nothing on the CPU.
 
     least: columns (tuple) whose least entry is wanted, not the sum.
     """
@@ -88,17 +88,8 @@ def fold(m: ti.template(), first: ti.template(), last: ti.template(), least: ti.
 
 @ti.func
 def total_by_team(m: ti.template(), t, column: ti.template()):
-    """`total`, for thread t of the model's team: the same number for all threads."""
+    """Sum of a column of the model's partial sums, in a fixed order, after `fold`: for thread t of its team, the same for all."""
     s = ti.cast(0.0, ti.f64)
     for j in range(m.team.share(t, m.sums)):
         s += m.state.partial[m.team.term(t, j), column]
     return m.team.total(t, s)
-
-
-@ti.func
-def total(m: ti.template(), column: ti.template()):
-    """Sum of a column of the model's partial sums, in a fixed order, after `fold`."""
-    s = ti.cast(0.0, ti.f64)
-    for c in range(m.sums):
-        s += m.state.partial[c, column]
-    return s

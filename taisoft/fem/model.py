@@ -106,7 +106,7 @@ class Model:
 
     @property
     def sums(self) -> int:
-        """Partial sums that `fem.chunks.total` adds."""
+        """Partial sums that `fem.chunks.total_by_team` adds."""
         return self.chunks if self.on_cpu else min(self.chunks, FOLDED)
 
     @property

@@ -14,7 +14,7 @@ from typing import Any, Protocol
 import taichi as ti
 
 from taisoft.backend.runtime import kernel
-from taisoft.fem.chunks import chunk_entry, chunk_size, fold, total
+from taisoft.fem.chunks import chunk_entry, chunk_size, fold, total_by_team
 from taisoft.fem.model import Model
 from taisoft.fem.state import OTHER_SUM, SUM
 from taisoft.linear.block_csr import BlockCsr, block_times, off_diagonal_times
@@ -125,9 +125,11 @@ def start(
                 _clear_node(model, work, i)
     preconditioner.apply(model, work)
     fold(model, OTHER_SUM, OTHER_SUM, ())
-    ti.loop_config(serialize=True)
-    for _ in range(1):
-        begin_with(work, tolerance, total(model, OTHER_SUM))
+    ti.loop_config(serialize=model.team.alone, block_dim=model.team.threads)
+    for t in range(model.team.threads):
+        rz = total_by_team(model, t, OTHER_SUM)
+        if t == 0:
+            begin_with(work, tolerance, rz)
     _turn(model, work)
 
 
@@ -144,10 +146,11 @@ def iterate(
     """Run one iteration, or nothing if the status is not RUNNING."""
     _multiply(model, A, terms, border, work)
     fold(model, SUM, SUM, ())
-    ti.loop_config(serialize=True)
-    for _ in range(1):
-        if work.state[STATUS] == RUNNING:
-            set_step(work, total(model, SUM))
+    ti.loop_config(serialize=model.team.alone, block_dim=model.team.threads)
+    for t in range(model.team.threads):
+        curvature = total_by_team(model, t, SUM)
+        if t == 0 and work.state[STATUS] == RUNNING:
+            set_step(work, curvature)
     ti.loop_config(serialize=model.serial)
     for task in range(model.chunks * model.spread):
         if task % model.spread == 0 and (work.state[STATUS] == RUNNING or work.state[STATUS] == NEGATIVE_PENDING):
@@ -156,9 +159,11 @@ def iterate(
                 _move_node(work, chunk_entry(model, c, at, n), step)
     preconditioner.apply(model, work)
     fold(model, OTHER_SUM, OTHER_SUM, ())
-    ti.loop_config(serialize=True)
-    for _ in range(1):
-        end_iteration(work, tolerance, total(model, OTHER_SUM))
+    ti.loop_config(serialize=model.team.alone, block_dim=model.team.threads)
+    for t in range(model.team.threads):
+        rz = total_by_team(model, t, OTHER_SUM)
+        if t == 0:
+            end_iteration(work, tolerance, rz)
     _turn(model, work)
 
 

@@ -11,6 +11,7 @@
 import pytest
 
 import taisoft as ts
+from taisoft.backend.arrays import Array
 from taisoft.backend.counters import FILLS, counting, device_only
 from taisoft.backend.paths import AS_WRITTEN, Order, gpu_path
 from taisoft.dynamics import explicit_batch
@@ -153,23 +154,42 @@ def test_events_end_as_single_substeps(event, integrator, on_gpu_path, singly, e
     assert isinstance(found[0][-1], str) == (event == FAULT)
 
 
-def test_an_interrupt_leaves_the_last_accepted_substep(monkeypatch):
-    plain, count = Batch.launch, []
+def test_a_batch_begins_with_room_for_its_contacts(singly):
+    """A cube falls on many half-spaces, whose contacts are more than the problem holds at first."""
+    made = scene(cells=(3, 3, 3))
+    for k in range(120):
+        made.add_obstacle(ts.HalfSpace((0, 0, 0), (0, 1, 0)), name=f"ground {k}")
+    found = run(made, 2 * MOST)
+    assert found == singly(run, made, 2 * MOST) and found[0][-1][-2] > 1240  # contacts
 
-    def interrupted(*arguments):
-        count.append(1)
-        if len(count) == 2 * MOST + 6:
-            raise KeyboardInterrupt
-        plain(*arguments)
 
-    monkeypatch.setattr(Batch, "launch", interrupted)
+@pytest.mark.parametrize("place", ["launch", "begin", "read"])
+def test_an_interrupt_leaves_the_last_accepted_substep(place, monkeypatch):
+    n_before, count = 2 * MOST + 5, []
+
+    def interrupted(plain, at: int):
+        def call(*arguments):
+            count.append(1)
+            if len(count) == at:
+                raise KeyboardInterrupt
+            return plain(*arguments)
+
+        return call
+
     with dynamics(scene(), dt=DT, integrator="velocity_verlet", precision="f64") as sim:
-        while sim.state.step_count < 10:
-            take(sim, 10)
+        take(sim, 10)
+        if place == "launch":
+            monkeypatch.setattr(Batch, "launch", interrupted(Batch.launch, n_before + 1))
+        elif place == "begin":
+            monkeypatch.setattr(explicit_batch, "begin_tally", interrupted(explicit_batch.begin_tally, 3))
+        else:
+            monkeypatch.setattr(Array, "to_numpy", interrupted(Array.to_numpy, 2))
         with pytest.raises(KeyboardInterrupt):
             sim.advance(3 * MOST)
+        monkeypatch.undo()
         at, positions = sim.state.step_count, sim.state.state()[0]
-    assert len(count) - 1 == at
+        assert at == 10 + {"launch": n_before, "begin": 2 * MOST, "read": 2 * MOST}[place]
+        take(sim, 10)
     with dynamics(scene(), dt=DT, integrator="velocity_verlet", precision="f64") as sim:
         take(sim, at)
         assert (sim.state.state()[0] == positions).all()

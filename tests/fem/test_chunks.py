@@ -11,7 +11,7 @@ import taichi as ti
 import taisoft as ts
 from taisoft.backend.arrays import FieldArena
 from taisoft.backend.runtime import kernel
-from taisoft.fem.chunks import FOLDED, chunk_entry, chunk_size, fold, total
+from taisoft.fem.chunks import FOLDED, chunk_entry, chunk_size, fold, total_by_team
 from taisoft.fem.state import N_COLUMNS, OTHER_SUM, SUM
 from tests.dynamics.scenes import built, mixed_scene, use_threads
 
@@ -56,7 +56,7 @@ def sum_entries(m: ti.template(), values: ti.types.ndarray(), out: ti.types.ndar
     fold(m, SUM, OTHER_SUM, (OTHER_SUM,))
     ti.loop_config(serialize=True)
     for _ in range(1):
-        out[0], out[1] = total(m, SUM), m.state.partial[0, OTHER_SUM]
+        out[0], out[1] = total_by_team(m, 0, SUM), m.state.partial[0, OTHER_SUM]
         for c in range(1, m.sums):
             out[1] = ti.min(out[1], m.state.partial[c, OTHER_SUM])
 

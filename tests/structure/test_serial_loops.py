@@ -24,10 +24,6 @@ CPU_ONLY = {  # (file, function): why it does not run on the GPU path, or why it
     ("collision/reduction.py", "_fill_cells"): "doubles a number until it is large enough",
     **{("view/raster.py", name): "draws pictures, outside of steps" for name in ("set_up", "enlist")},
 }
-REMAINING = {  # file: functions with loops that are still to be divided among threads
-    "dynamics/linearised.py": ("_find_residual",),
-    "linear/pcg.py": ("start", "iterate"),
-}
 ON_CPU = ("on_cpu", "serial")  # attributes that are true on the CPU path only
 
 
@@ -142,7 +138,7 @@ def test_no_loop_over_entries_runs_on_one_gpu_thread():
     found = []
     for name, defined in functions().items():
         for file, node in defined:
-            if (file, name) not in CPU_ONLY and name not in REMAINING.get(file, ()):
+            if (file, name) not in CPU_ONLY:
                 found += [f"{file}:{line} {name}" for line in serial_loops(node)]
     assert not found, "\n".join(found)
     assert all(any(file == where for where, _ in functions().get(name, ())) for file, name in CPU_ONLY)

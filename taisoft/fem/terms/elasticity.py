@@ -135,10 +135,10 @@ def prepare_terms(m: ti.template()):
 
 
 @ti.func
-def sum_elements_with_damping(m: ti.template(), counts):
+def sum_elements_with_damping(m: ti.template(), go):
     """As `sum_elements` over all blocks, with stiffness damping if it is on.
 
-    counts: 1 to update the scalars LOWEST_J, INVERTED_NOW and FAILED, else 0.
+    go: 1, or 0 to leave out the elements. scalars: LOWEST_J, INVERTED_NOW, FAILED.
     """
     place_all(m)
     find_dilatations(m)
@@ -147,13 +147,13 @@ def sum_elements_with_damping(m: ti.template(), counts):
     if ti.static(m.on_cpu):
         ti.loop_config(serialize=m.serial)
         for task in range(m.chunks * m.spread):
-            if task % m.spread == 0:
+            if task % m.spread == 0 and go == 1:
                 J, bad = sum_chunk(m, task // m.spread)
                 low, count = lowest_and_count(m, J, bad)
                 m.state.partial[task // m.spread, SUM] = ti.cast(low, ti.f64)
                 m.state.partial[task // m.spread, OTHER_SUM] = ti.cast(count, ti.f64)
         ti.loop_config(serialize=True)
-        for c in range(counts * m.chunks):
+        for c in range(go * m.chunks):
             low = m.state.partial[c, SUM]
             m.state.scalars[LOWEST_J] = ti.min(m.state.scalars[LOWEST_J], low)
             m.state.scalars[INVERTED_NOW] = m.state.scalars[INVERTED_NOW] + m.state.partial[c, OTHER_SUM]
@@ -161,10 +161,9 @@ def sum_elements_with_damping(m: ti.template(), counts):
                 m.state.scalars[FAILED] = 1.0
     else:
         for g in ti.static(m.groups):
-            for b in range(g.first, g.last):
+            for b in range(g.first, ti.select(go == 1, g.last, g.first)):
                 J = element_force(m, g, m.stiffness_damping, b)
-                if counts == 1:
-                    record_volumes(m, J, count_inverted(m, b, J))
+                record_volumes(m, J, count_inverted(m, b, J))
     prepare_terms(m)
 
 
