@@ -122,7 +122,6 @@ def test_impulses_below_the_rounding_of_momenta_need_not_obey_the_laws(made, mon
     assert system.impulses_are_rounding()
 
 
-@pytest.mark.gpu_path
 def test_flush_blocks_come_to_rest():
     """Their redundant contacts exchange impulses, so that iterations stall in one step of four: those are solved directly."""
     scene = ts.Scene()
