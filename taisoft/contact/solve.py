@@ -9,7 +9,6 @@ Momentum and the strategy of the r-factors, see `strategy`, follow any kind of s
 
 from dataclasses import dataclass, field
 
-import numpy as np
 import taichi as ti
 
 from taisoft.backend.runtime import kernel
@@ -57,7 +56,8 @@ def solve(
 
     method: one of SOLVERS; coloured_gauss_seidel requires grouped contacts, see `colouring`. tolerance: bound on the residual.
     max_iterations: sweeps. every: sweeps between residual checks. history: whether to return the residual of each check.
-    momentum: False for the plain method. is_begun: whether `sweeps_of_team` has taken some of the sweeps.
+    momentum: False for the plain method. is_begun: whether `sweeps_of_team` has taken some of the sweeps, or
+    all that are needed.
     """
     n_contacts = int(problem.count[0])
     team, is_parallel = team_of(problem, method, n_contacts)
@@ -75,12 +75,7 @@ def solve(
     if not state[RESIDUAL] <= state[BEST]:
         _restore_best(problem, team)
         state[RESIDUAL] = state[BEST]
-    return result_of(state, tolerance, residuals)
-
-
-def result_of(state: np.ndarray, tolerance: float, residuals: list[float] | None = None) -> SolveResult:
-    """The result of a solve from the state of its sweeps."""
-    return SolveResult(int(state[SWEEPS]), float(state[RESIDUAL]), bool(state[RESIDUAL] <= tolerance), residuals or [])
+    return SolveResult(int(state[SWEEPS]), float(state[RESIDUAL]), bool(state[RESIDUAL] <= tolerance), residuals)
 
 
 def sweeps_per_launch(n_contacts: int, every: int = CHECK_EVERY) -> int:

@@ -137,6 +137,11 @@ class ContactStep:
             return None
         return max(capacity, 2 * n), max(most, 2 * entries)
 
+    def _make_room(self, n: int) -> None:
+        """Make room for the n contacts of the last search."""
+        if room := self._room(n, most_entries(self.simulation.model, n, self.detection.buffer.n_listed)):
+            self._allocate(*room)
+
     @property
     def has_paths(self) -> bool:
         """Whether motion is prescribed: the user may change it between two steps, and a path may end with the last one."""
@@ -297,8 +302,7 @@ class ContactStep:
         (surface, shapes, found, kept), counts = self.detection.found, self.detection.counts
         self.gap_targets = self._gap_targets()
         self.dropped, self._search_counts = max(self.dropped, counts.unmapped), (counts.found, counts.unmapped)
-        if room := self._room(n, most_entries(model, n, self.detection.buffer.n_listed)):
-            self._allocate(*room)
+        self._make_room(n)
         problem = self.problem
         if model.has_dependents and n:
             n = drop_vanishing(problem, model, surface, found, kept, n, 0, 0)  # the past's entries are needed no more
@@ -319,8 +323,7 @@ class ContactStep:
     def begin_batch(self) -> None:
         """Prepare for sub-steps that the host does not follow, after a search: there must be room for its contacts."""
         self.gap_targets, n = self._gap_targets(), self.detection.counts.contacts
-        if room := self._room(n, most_entries(self.simulation.model, n, 0)):
-            self._allocate(*room)
+        self._make_room(n)
 
     def end_batch(self, time: float, dt: float, n: int, found_before: int, found: int, kept: int, is_whole: bool) -> None:
         """Take over after sub-steps of dt [s] that the host has not followed; time: after those that were accepted.

@@ -37,7 +37,7 @@ def begin_tally(s: ti.template(), tally: ti.template(), found: ti.i32, kept: ti.
     """Begin a batch, after a search that found and kept so many contacts."""
     ti.loop_config(serialize=True)
     for _ in range(1):
-        s.run[GO], s.run[EVENT] = 1, NOTHING
+        s.run[EVENT] = NOTHING
         for k in ti.static(range(FOUND_BEFORE)):
             tally[k] = 0.0
         tally[FOUND_BEFORE] = tally[FOUND_LAST] = found

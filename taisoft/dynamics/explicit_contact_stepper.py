@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from taisoft.contact.colouring import colour_contacts
-from taisoft.contact.solve import SolveResult, result_of, solve, sweeps_per_launch, team_of
+from taisoft.contact.solve import SolveResult, solve, sweeps_per_launch, team_of
 from taisoft.dynamics.contact import BLOCKED, FREE, MAX_PASSAGES, TOLERANCE, ContactStep
 from taisoft.dynamics.explicit_batch import (
     ALL_SWEEPS,
@@ -230,9 +230,6 @@ class ContactExplicitStepper(ExplicitStepper):
         if event < NOT_SOLVED:
             sweeps = min(MAX_SWEEPS, sweeps_per_launch(n))
             begin_solve(problem, team, self.contact.detection.surface, method, tolerance, sweeps, MAX_SWEEPS, NOTHING)
-        found = result_of(problem.sweep.state.to_numpy(), tolerance)
-        if found.converged or found.iterations >= MAX_SWEEPS:
-            return found
         return solve(problem, method, tolerance, MAX_SWEEPS, is_begun=True)
 
     @property

@@ -36,7 +36,7 @@ def is_func(node: ast.AST) -> bool:
 
 @cache
 def functions() -> dict[str, list[tuple[str, ast.FunctionDef]]]:
-    """Kernel code by name, with its file: functions of one name are not told apart, nor are methods."""
+    """Kernel code by name, with its file: functions of one name are not distinguished, nor are methods."""
     found = {}
     for path in FILES:
         if "import taichi as ti" in path.read_text(encoding="utf-8"):
