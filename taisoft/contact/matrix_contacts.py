@@ -12,9 +12,8 @@ from taisoft.contact.augmented_lagrangian import residual_at
 from taisoft.contact.colouring import colour_greedy, matrix_graph, store
 from taisoft.contact.problem import ContactProblem, build_matrix_problem, fill_matrix_problem, read_entries
 from taisoft.contact.solve import SolveResult, solve
-from taisoft.ranges import owners
 
-DENSE, NEWTON = 900, 15  # most rows of a W for Newton's method, and its maximum iterations
+NEWTON, NEAR = 20, 4.0  # maximum iterations of Newton's method; residual over the tolerance from which it is looked at
 TIGHTER = 3  # solves, each to a smaller residual, until that with other r-factors is small enough
 OUTER = 30  # maximum iterations of the augmented Lagrangian
 
@@ -28,7 +27,7 @@ class MatrixContacts:
 
     def solve(
         self,
-        W: sp.spmatrix,
+        W: np.ndarray | sp.spmatrix,
         b: np.ndarray,
         friction: np.ndarray,
         r: np.ndarray,
@@ -42,11 +41,48 @@ class MatrixContacts:
         """Return impulses (k,3), from the start r (k,3), and the result; by Newton's method where sweeps do not suffice, or else
         by an augmented Lagrangian.
 
-        W: (3k,3k); b: (3k,); friction: (k,); method, tolerance, sweeps: as in `contact.solve.solve`; outer: maximum iterations of
-        the augmented Lagrangian. factor, limit: other r-factors (k,2), and a bound on the residual with these.
+        W: (3k,3k), an array for Newton's method, which is then tried first, too; b: (3k,); friction: (k,); method, tolerance,
+        sweeps: as in `contact.solve.solve`; outer: maximum iterations of the augmented Lagrangian. factor, limit: other r-factors
+        (k,2), and a bound on the residual with these.
         """
-        W, k = sp.bsr_matrix(W, blocksize=(3, 3)), len(friction)
-        p = self._problem
+        is_dense, own, iterations = isinstance(W, np.ndarray), augmented_lagrangian.find_factors(W), 0
+
+        def residuals(r: np.ndarray) -> tuple[float, float]:
+            u = (W @ r.reshape(-1) + b).reshape(-1, 3)
+            return residual_at(u, friction, own, r), 0.0 if factor is None else residual_at(u, friction, factor, r)
+
+        def holds(r: np.ndarray) -> bool:
+            found = residuals(r)
+            return found[0] <= tolerance and found[1] <= limit
+
+        def by_newton(r: np.ndarray) -> tuple[np.ndarray, SolveResult] | None:
+            found = semismooth.solve(W, b, friction, r, own, holds, NEAR * tolerance, NEWTON) if is_dense else None
+            return found and (found[0], SolveResult(iterations + found[1], residuals(found[0])[0], True))
+
+        if found := by_newton(r):
+            return found
+        p = self._store(sp.bsr_matrix(W, blocksize=(3, 3)), b, friction, r, method)
+        goal = tolerance
+        for _ in range(1 if factor is None else TIGHTER):
+            result = solve(p, method, goal, sweeps)
+            r, iterations = p.r.to_numpy(len(friction)), iterations + result.iterations
+            if result.converged and holds(r):
+                return r, replace(result, iterations=iterations)
+            if found := by_newton(r):
+                return found
+            if not result.converged:
+                r, history = augmented_lagrangian.solve(sp.csr_matrix(W), b, friction, r, goal, outer)
+                iterations += len(history) - 1
+                result = SolveResult(iterations, history[-1], history[-1] <= goal)
+                if not result.converged or holds(r):
+                    break
+                p.r.from_numpy(r, 0)
+            goal *= 0.5 * limit / max(residuals(r)[1], limit)
+        return r, replace(result, iterations=iterations)
+
+    def _store(self, W: sp.bsr_matrix, b: np.ndarray, friction: np.ndarray, r: np.ndarray, method: str) -> ContactProblem:
+        """Return the problem in fields."""
+        p, k = self._problem, len(friction)
         if p is None or p.capacity < k or p.column.shape[0] < len(W.indices):
             arena = FieldArena()
             self._problem = p = build_matrix_problem(arena, 2 * k, 2 * len(W.indices), self._serial)
@@ -56,35 +92,7 @@ class MatrixContacts:
         p.r.from_numpy(r, 0)
         if method == "coloured_gauss_seidel":
             store(p, colour_greedy(matrix_graph(W)))
-
-        is_dense = factor is not None and 3 * k <= DENSE  # without other factors, islands are solved one by one
-        product, own = _dense(W) if is_dense else W, augmented_lagrangian.find_factors(W)
-
-        def residuals(r: np.ndarray) -> tuple[float, float]:
-            u = (product @ r.reshape(-1) + b).reshape(-1, 3)
-            return residual_at(u, friction, own, r), 0.0 if factor is None else residual_at(u, friction, factor, r)
-
-        def holds(r: np.ndarray) -> bool:
-            found = residuals(r)
-            return found[0] <= tolerance and found[1] <= limit
-
-        goal, iterations = tolerance, 0
-        for _ in range(1 if factor is None else TIGHTER):
-            result = solve(p, method, goal, sweeps)
-            r, iterations = p.r.to_numpy(k), iterations + result.iterations
-            if result.converged and holds(r):
-                return r, replace(result, iterations=iterations)
-            if is_dense and (found := semismooth.solve(product, b, friction, r, own, holds, NEWTON)):
-                return found[0], SolveResult(iterations + found[1], residuals(found[0])[0], True)
-            if not result.converged:
-                r, history = augmented_lagrangian.solve(W.tocsr(), b, friction, r, goal, outer)
-                iterations += len(history) - 1
-                result = SolveResult(iterations, history[-1], history[-1] <= goal)
-                if not result.converged or holds(r):
-                    break
-                p.r.from_numpy(r, 0)
-            goal *= 0.5 * limit / max(residuals(r)[1], limit)
-        return r, replace(result, iterations=iterations)
+        return p
 
     @property
     def field_bytes(self) -> dict[str, int]:
@@ -94,14 +102,6 @@ class MatrixContacts:
     def release(self) -> None:
         """Free the fields."""
         self._arena.release()
-
-
-def _dense(W: sp.bsr_matrix) -> np.ndarray:
-    """W (3k,3k)."""
-    k = len(W.indptr) - 1
-    blocks = np.zeros((k, k, 3, 3))
-    blocks[owners(np.diff(W.indptr)), W.indices] = W.data
-    return blocks.swapaxes(1, 2).reshape(3 * k, 3 * k)
 
 
 def frames(p: ContactProblem) -> np.ndarray:

@@ -14,15 +14,14 @@ import math
 from typing import Any
 
 import numpy as np
-import scipy.linalg as sl
 import scipy.sparse as sp
 
 from taisoft.backend.arrays import download, upload
-from taisoft.contact import augmented_lagrangian
-from taisoft.contact.matrix_contacts import OUTER, MatrixContacts, frames
-from taisoft.contact.problem import read_entries
+from taisoft.contact.matrix_contacts import OUTER, MatrixContacts, jacobian
 from taisoft.dynamics.contact_terms import StageContacts
+from taisoft.dynamics.delassus import Delassus, assemble, begin_direct, end_direct, move_directly
 from taisoft.fem.model import Model
+from taisoft.fem.state import LAW
 from taisoft.linear.block_csr import BLOCK, BlockCsr
 from taisoft.linear.factor import Factor, build_factor
 from taisoft.ranges import owners
@@ -54,6 +53,7 @@ class DirectSolver:
         self._max_rows, *self._limits = self.RIGID if self.is_rigid else self.SOFT
         self._nodes = np.flatnonzero(m.dependents.number.to_numpy() < 0) if m.has_dependents else np.arange(m.n_nodes)
         self._factor: Factor | None = None
+        self._delassus: Delassus | None = None
         self._has_factor = False  # of the present matrix
         self._free = np.zeros((0, 3))  # (nodes, 3), 1 on free axes, of the last factor
 
@@ -87,7 +87,8 @@ class DirectSolver:
         blocks = np.concatenate([among, self._A.column.shape[0] + self._nodes])[order]  # among those of A, then its diagonal
         row, column = row[order], column[order]
         start = np.concatenate([[0], np.cumsum(np.bincount(row, minlength=len(own)))])
-        self._number, self._factor = number, build_factor(start, column, 3)
+        self._factor = build_factor(start, column, 3)
+        self._delassus = Delassus(m, self._factor, self._nodes, self._max_rows // 3)
         # entries of the lower triangle: row and column, and place among the stored numbers
         block, i, j = np.unravel_index(self._factor.fronts.lower, (len(row), 3, 3))
         self._row, self._column, self._stored = 3 * row[block] + i, 3 * column[block] + j, BLOCK * blocks[block] + 4 * j + i
@@ -122,46 +123,6 @@ class DirectSolver:
         self._values = values
         self._factor.fronts.factorise(values)
 
-    def _find_rows(self, entries: tuple, axes: np.ndarray, friction: np.ndarray) -> None:
-        """Find the rows of J (entries, axes of the contact, of the node), 0 for tangents without friction.
-
-        entries: of the contacts, see `read_entries`; axes: their `frames`; friction: (k,).
-        """
-        contact, node, weight = entries
-        J = axes.copy()
-        J[friction == 0.0, 1:] = 0.0
-        node = self._number[node]
-        self._J = contact, node, weight[:, None, None] * J[contact] * self._free[node][:, None, :]
-
-    def _find_delassus(self, active: np.ndarray) -> sp.bsr_matrix:
-        """Return W of the active contacts (k,), numbered anew."""
-        (contact, node, J), factor, n = self._J, self._factor.fronts, int(active.sum())
-        contact = np.where(active, np.cumsum(active) - 1, -1)[contact]
-        entry, axis, of = np.nonzero(J * (contact >= 0)[:, None, None])
-        row, column, J = 3 * contact[entry] + axis, factor.place[3 * node[entry] + of], J[entry, axis, of]
-        keys, blocks = [], []
-        for part in factor.parts:
-            unknowns = factor.unknowns_of(part)
-            inside = (column >= unknowns.start) & (column < unknowns.stop)
-            if inside.any():
-                rows, at = np.unique(row[inside], return_inverse=True)
-                Y = np.zeros((unknowns.stop - unknowns.start, len(rows)))
-                np.add.at(Y.reshape(-1), (column[inside] - unknowns.start) * len(rows) + at, J[inside])
-                factor.forward(part, Y)
-                touched = np.unique(rows // 3)
-                W, place = np.zeros((3 * len(touched),) * 2), np.searchsorted(touched, rows // 3) * 3 + rows % 3
-                half = sl.blas.dsyrk(1.0, Y.T, lower=1)
-                W[place[:, None], place] = half + np.tril(half, -1).T
-                keys.append((touched[:, None] * n + touched).reshape(-1))
-                blocks.append(W.reshape(len(touched), 3, -1, 3).swapaxes(1, 2).reshape(-1, 3, 3))
-        if not keys:  # no contact can move
-            return sp.bsr_matrix((3 * n, 3 * n), blocksize=(3, 3))
-        key, at = np.unique(np.concatenate(keys), return_inverse=True)
-        whole = np.zeros((len(key), 3, 3))
-        np.add.at(whole, at, np.concatenate(blocks))
-        start = np.concatenate([[0], np.cumsum(np.bincount(key // n, minlength=n))])
-        return sp.bsr_matrix((whole, key % n, start), shape=(3 * n, 3 * n))
-
     def solve(
         self, stage_contacts: StageContacts, beta: float, tolerance: float, acceptable: float, with_residual: bool
     ) -> tuple[int, bool, float] | None:
@@ -171,84 +132,52 @@ class DirectSolver:
         the laws' residual. acceptable: that residual above which a result is rejected, the state kept, and None returned.
         with_residual: whether to measure |r|, which is rounding; else it is 0.
         """
-        m, k = self._model, stage_contacts
+        m, k, w = self._model, stage_contacts, self._delassus.unknowns
         p, n = k.problem, int(k.problem.count[0])
-        # at the present x: iterations may have moved it, and the residual with it
-        x, v, residual = download([m.state.x, m.state.v, k.residual_linear])
-        residual = (self._free * residual.astype(np.float64)[self._nodes]).reshape(-1)
-        change = -self._factor.solution(residual)  # without impulses
+        begin_direct(m, k, w, beta)
         friction, factor, r = download([p.friction, p.factor, k.work.kept], n)
-        entries, axes = read_entries(p), frames(p)
-        self._find_rows(entries, axes, friction)
-        start = self._velocities(k, entries, axes, x, beta)
+        start, without = download([k.work.velocity], n)[0], w.factor.rhs.to_numpy()
+        given, impulses = p.r.to_numpy(), np.zeros((n, 3))
         active, iterations = (r[:, 0] > 0.0) | (start[:, 0] < 0.0), 0
-        b = start + self._contact_velocities(change, n)
         for _ in range(self.ROUNDS):
-            r, n_iterations = self._solve_active(active, b, r, friction, factor, tolerance)
-            change = self._factor.solution(self._forces(r) - residual)
-            iterations += n_iterations
-            u = start + self._contact_velocities(change, n)
-            if not (closes := ~active & (u[:, 0] < 0.0)).any():
+            w.factor.rhs.from_numpy(without)
+            if active.any():
+                parts, count = self._delassus.form(p, active)
+                W, b = assemble(parts, count, self.SOFT[0]), start[active].reshape(-1)
+                for part in parts:
+                    b[part.rows] += part.Y.T @ without[part.unknowns]
+                limits = self.FRACTION * tolerance, *self._limits, factor[active], self.MET * tolerance
+                impulses[active], result = self._contacts.solve(W, b, friction[active], r[active], "gauss_seidel", *limits)
+                iterations += result.iterations
+                for part in parts:
+                    w.factor.rhs.host[part.unknowns] += part.Y @ impulses[active].reshape(-1)[part.rows]
+            p.r.from_numpy(impulses, 0)
+            end_direct(m, k, w)
+            if not (closes := ~active & (download([k.work.rate], n)[0][:, 0] < 0.0)).any():
                 break
-            active |= closes
-        law_residual = augmented_lagrangian.residual_at(u, friction, factor, r)
+            active, r = active | closes, impulses.copy()
+        law_residual = m.state.scalars[LAW]
         if not (self.is_rigid or law_residual <= acceptable):  # also if it is not a number
+            upload([(p.r, given)])
             return None
-        impulses = p.r.to_numpy()
-        x[self._nodes] += beta * change.reshape(-1, 3)
-        v[self._nodes] = (x[self._nodes] - self._x_hat.to_numpy()[self._nodes]) / beta
-        impulses[:n] = r
-        upload([(m.state.x, x), (m.state.v, v), (p.r, impulses)])
-        return iterations, law_residual <= tolerance, self._imbalance(change, residual, r) if with_residual else 0.0
+        move_directly(m, w, self._x_hat, beta)
+        return iterations, law_residual <= tolerance, self._imbalance(k, impulses) if with_residual else 0.0
 
-    def _solve_active(
-        self, active: np.ndarray, b: np.ndarray, r: np.ndarray, friction: np.ndarray, factor: np.ndarray, tolerance: float
-    ) -> tuple[np.ndarray, int]:
-        """Return impulses (k,3), which only active contacts have, and the number of iterations from the start r. b: (k,3)."""
-        found = np.zeros_like(r)
-        if not active.any():
-            return found, 0
-        given = friction[active], r[active], "gauss_seidel", self.FRACTION * tolerance, *self._limits
-        W = self._find_delassus(active)
-        found[active], result = self._contacts.solve(W, b[active].reshape(-1), *given, factor[active], self.MET * tolerance)
-        return found, result.iterations
-
-    def _forces(self, r: np.ndarray) -> np.ndarray:
-        """J^T r (n,) of impulses r (k,3)."""
-        contact, node, J = self._J
-        found = np.zeros((len(self._nodes), 3))
-        np.add.at(found, node, np.einsum("eij,ei->ej", J, r[contact]))
-        return found.reshape(-1)
-
-    def _contact_velocities(self, change: np.ndarray, n: int) -> np.ndarray:
-        """J s (k,3) of a change s (n,) of v."""
-        contact, node, J = self._J
-        found = np.zeros((n, 3))
-        np.add.at(found, contact, np.einsum("eij,ej->ei", J, change.reshape(-1, 3)[node]))
-        return found
-
-    def _imbalance(self, change: np.ndarray, residual: np.ndarray, r: np.ndarray) -> float:
-        """|A s - J^T r + r_0| of a change s (n,)."""
-        n = len(change)
-        lower = sp.csr_matrix((self._values, (self._row, self._column)), shape=(n, n))
-        left = lower @ change + lower.T @ change - lower.diagonal() * change
-        return float(np.linalg.norm(left + residual - self._forces(r)))
-
-    def _velocities(self, k: StageContacts, entries: tuple, axes: np.ndarray, x: np.ndarray, beta: float) -> np.ndarray:
-        """u (k,3) at positions x (n_nodes,3), see `contact_terms.stage_velocity_of`. entries, axes: as for `_find_rows`."""
-        gap, offset = download([k.work.gap_minus_target, k.work.tangential_offset], len(axes))
-        contact, node, weight = entries
-        moved = np.zeros((len(axes), 3))
-        np.add.at(moved, contact, weight[:, None] * (x - k.x_start.to_numpy())[node])
-        u = np.einsum("kij,kj->ki", axes, moved + offset)
-        u[:, 0] = gap + np.einsum("kj,kj->k", axes[:, 0], moved)
-        return u / beta
+    def _imbalance(self, k: StageContacts, impulses: np.ndarray) -> float:
+        """|A s - J^T r + r_0| of the change s of v in the factor's right-hand side."""
+        fronts, n = self._factor.fronts, len(self._nodes)
+        s, free = self._factor.rhs.to_numpy()[fronts.place], self._model.free.to_numpy()[self._nodes].reshape(-1)
+        lower = sp.csr_matrix((self._values, (self._row, self._column)), shape=(3 * n, 3 * n))
+        applied = (jacobian(k.problem).T @ impulses.reshape(-1)).reshape(-1, 3) - k.residual_linear.to_numpy()
+        return float(np.linalg.norm(lower @ s + lower.T @ s - lower.diagonal() * s - free * applied[self._nodes].reshape(-1)))
 
     @property
     def field_bytes(self) -> dict[str, int]:
         """Bytes by name."""
-        return self._contacts.field_bytes
+        return self._contacts.field_bytes | (self._delassus.field_bytes if self._delassus else {})
 
     def release(self) -> None:
         """Free the fields."""
         self._contacts.release()
+        if self._delassus:
+            self._delassus.release()

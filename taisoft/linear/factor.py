@@ -103,6 +103,13 @@ def factorised(A: sp.bsr_matrix, known: Factor | None = None) -> Factor:
 @ti.func
 def substitute(L: ti.template()):
     """Replace the right-hand side by (L L^T)^-1 times it, inside a serial loop."""
+    substitute_forward(L)
+    substitute_backward(L)
+
+
+@ti.func
+def substitute_forward(L: ti.template()):
+    """Replace the right-hand side by L^-1 times it."""
     for f in range(L.n_fronts):
         first, width, start = L.first[f], L.first[f + 1] - L.first[f], L.start[f]
         below = L.start[f + 1] - start
@@ -116,6 +123,11 @@ def substitute(L: ti.template()):
             subtract(L.below, 0, y, L.value, low, 0, below)
         for k in range(below):
             L.rhs[L.row[start + k]] = L.rhs[L.row[start + k]] + L.below[k]
+
+
+@ti.func
+def substitute_backward(L: ti.template()):
+    """Replace the right-hand side by L^-T times it."""
     for reverse_front in range(L.n_fronts):
         f = L.n_fronts - 1 - reverse_front
         first, width, start = L.first[f], L.first[f + 1] - L.first[f], L.start[f]

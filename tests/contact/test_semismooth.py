@@ -20,7 +20,7 @@ def solved(W, b, friction, start, most: int = 30) -> tuple[np.ndarray, int] | No
     def holds(r: np.ndarray) -> bool:
         return find_residual(W, b, friction, r) <= TOLERANCE
 
-    return semismooth.solve(W, b, friction, start, find_factors(W), holds, most)
+    return semismooth.solve(W, b, friction, start, find_factors(W), holds, 4 * TOLERANCE, most)
 
 
 @pytest.mark.parametrize(
