@@ -99,7 +99,7 @@ def _fill_rows(m: ti.template(), p: ti.template(), w: ti.template(), Y: ti.templ
 
 @kernel
 def begin_direct(m: ti.template(), k: ti.template(), w: ti.template(), beta: ti.f64):
-    """Set work.velocity to u at the present x, and the factor's right-hand side to -L^-1 r_0, r_0 the residual without contacts."""
+    """Set work.velocity to u at the present x, and the factor's right-hand side to -L^-1 r_0."""
     ti.loop_config(serialize=True)
     for c in range(k.problem.count[0]):
         k.work.velocity[c] = stage_velocity_of(k, c, beta)
@@ -204,19 +204,14 @@ class Delassus:
 
 def assemble(parts: list[Part], k: int, most: int) -> np.ndarray | sp.bsr_matrix:
     """W (3k,3k) of k contacts, dense if there are at most so many rows."""
-    blocks = []
-    for part in parts:
-        lower = sl.blas.dsyrk(1.0, part.Y.T, lower=1)
-        blocks.append(lower + np.tril(lower, -1).T)
+    lower = [sl.blas.dsyrk(1.0, part.Y.T, lower=1) for part in parts]
+    blocks = [one + np.tril(one, -1).T for one in lower]
     if 3 * k <= most:
         W = np.zeros((3 * k, 3 * k))
         for part, block in zip(parts, blocks):
             W[part.rows[:, None], part.rows] += block
         return W
-    rows = [np.repeat(part.rows, len(part.rows)) for part in parts]
-    columns = [np.tile(part.rows, len(part.rows)) for part in parts]
-    whole = (
-        np.concatenate([one.reshape(-1) for one in (*blocks, np.zeros(0))]),
-        [np.concatenate([*found, np.zeros(0, int)]) for found in (rows, columns)],
-    )
-    return sp.coo_matrix(whole, shape=(3 * k, 3 * k)).tobsr((3, 3))
+    rows = np.concatenate([np.repeat(part.rows, len(part.rows)) for part in parts])
+    columns = np.concatenate([np.tile(part.rows, len(part.rows)) for part in parts])
+    values = np.concatenate([block.reshape(-1) for block in blocks])
+    return sp.coo_matrix((values, (rows, columns)), shape=(3 * k, 3 * k)).tobsr((3, 3))

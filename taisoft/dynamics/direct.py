@@ -55,11 +55,17 @@ class DirectSolver:
         self._factor: Factor | None = None
         self._delassus: Delassus | None = None
         self._has_factor = False  # of the present matrix
+        self._formed: tuple | None = None  # active contacts, parts of Y, and W, of that and the present rows
         self._free = np.zeros((0, 3))  # (nodes, 3), 1 on free axes, of the last factor
 
     def matrix_changed(self) -> None:
         """Update for a matrix that was formed."""
         self._has_factor = False
+        self.rows_changed()
+
+    def rows_changed(self) -> None:
+        """Update for contacts that have changed."""
+        self._formed = None
 
     def seconds(self, stage_contacts: StageContacts) -> float:
         """Expected duration of a solve with the contacts that have an impulse, infinite if there are too many contacts."""
@@ -142,8 +148,10 @@ class DirectSolver:
         for _ in range(self.ROUNDS):
             w.factor.rhs.from_numpy(without)
             if active.any():
-                parts, count = self._delassus.form(p, active)
-                W, b = assemble(parts, count, self.SOFT[0]), start[active].reshape(-1)
+                if self._formed is None or not np.array_equal(self._formed[0], active):
+                    parts, count = self._delassus.form(p, active)
+                    self._formed = active, parts, assemble(parts, count, self.SOFT[0])
+                (_, parts, W), b = self._formed, start[active].reshape(-1)
                 for part in parts:
                     b[part.rows] += part.Y.T @ without[part.unknowns]
                 limits = self.FRACTION * tolerance, *self._limits, factor[active], self.MET * tolerance

@@ -16,14 +16,17 @@ class FrictionalProblems:
     LAW_BALANCE = 0.03  # laws' residual over the required relative |r|; the next matrix would undo more accuracy
     MULTIPLIER_FRACTION = 0.3  # of the required |r|, ends the steps under one multiplier: updates at a large |r| overshoot
     NEAR_FLOOR = 6.0  # times the floor of |r|: below it, |r| may be mostly rigid motion
-    TRIAL = 16  # problems in a row that are solved directly before a stage tries iterations again
+    # problems in a row that are solved directly before a stage tries iterations again; twice as many after each trial in vain
+    TRIAL, RAREST = 16, 256
     R_STALLED, MAX_R_STALLED = 1000.0, 1e5  # smallest first R and upper bound without friction, where the laws stalled before
 
     def __init__(self, system: StageSystem, stage: Stage):
         self._system, self._stage = system, stage
         self.tight = False  # whether the last problem was near the floor
         self._was_direct = False  # whether it was solved directly
-        self._is_trial = system.n_direct >= self.TRIAL  # whether the stage's first problem is one
+        self._is_trial = system.n_direct >= min(
+            self.TRIAL << system.n_in_vain, self.RAREST
+        )  # whether the stage's first problem is one
         self._law_aim = stage.law_aim
         self._r_scale, self._max_r_scale = FIRST_R, MAX_R_FRICTIONLESS
 
@@ -57,9 +60,11 @@ class FrictionalProblems:
 
     def count(self, goal: Goal, found: Solution) -> None:
         """Count the problems in a row that were solved directly since iterations took too long."""
-        n, self._was_direct, self._is_trial = 0 if self._is_trial else self._system.n_direct, found.direct, False
+        system, was_trial, self._was_direct, self._is_trial = self._system, self._is_trial, found.direct, False
+        n = 0 if was_trial else system.n_direct
         took_long = n > 0 or 1 < found.solves <= goal.max_solves
-        self._system.n_direct = n + 1 if found.direct and took_long else 0
+        system.n_direct = n + 1 if found.direct and took_long else 0
+        system.n_in_vain = system.n_in_vain + was_trial if system.n_direct else 0
 
     def learn(self, goal: Goal, found: Solution) -> None:
         """Take account of a problem's solution."""

@@ -50,6 +50,7 @@ class Newton:
     # a step that leaves a larger fraction of |r| requires a new matrix; with curved steps, whose first matrix is that of the
     # step's start and whose solves are longer
     REBUILD_RATIO, REBUILD_VOLUMES = 0.2, 0.01
+    NEAR = 100.0  # times the tolerance: |r| that a direct solve leaves below which its factor serves once more
     LINEAR_LIMIT = 0.01  # relative true residual above which a linearised stage without contacts has failed
     LINEARISED_SOLVES, LINEARISED_FORCING = 400, 0.1  # maximum linear solves of one with contacts, and their tolerance
 
@@ -61,6 +62,10 @@ class Newton:
         self.max_forcing = self.MAX_FORCING if stage.c > 0.0 else self.STATIC_FORCING
         self.newton = self.linear = self.multigrid = self.updates = self.n_corrections = 0
         self.most, self.is_projected = stage.max_newton, False  # the latter of the last iteration
+        self.keeps = False  # the factor for another problem
+        self.solved = self.solved_before = (
+            math.inf
+        )  # |r| that the last direct solve left, with the contacts' geometry that it had
         self.problems = FrictionalProblems(system, stage)
 
     def run(self, fresh: bool) -> StageResult:
@@ -78,14 +83,14 @@ class Newton:
                     break
             if not self._may_go_on():
                 break
-            if not fresh or self._needs_matrix():
+            if not (fresh or self._keeps_factor()) or self._needs_matrix():
                 if system.kind == ELASTIC_STAGE:
                     system.form_matrix()
                 self.n_uses = 0
             self.n_uses += 1
             moved = self._iterate_rows() if self.has_rows else self._iterate()
             self._find_rounding()
-            if not moved and self.n_uses == 1 and not self._has_converged():
+            if not moved and self.n_uses == 1 and not (self.keeps or self._has_converged()):
                 break
             fresh = moved and not self.has_rows
             decrease = self.PROJECTED if self.is_projected else self.DECREASE
@@ -208,7 +213,14 @@ class Newton:
     def _needs_matrix(self) -> bool:
         """Whether a matrix that is formed is used up."""
         ratio = self.REBUILD_VOLUMES if self.system.keeps_volumes else self.REBUILD_RATIO
-        return self.n_uses >= 1 and self.r > ratio * self.previous
+        return not self.has_rows and self.n_uses >= 1 and self.r > ratio * self.previous
+
+    def _keeps_factor(self) -> bool:
+        """Whether the next frictional problem takes the factor of the last one, which led near enough."""
+        before, self.solved_before = self.solved_before, self.solved
+        near, is_slow = self.NEAR * self.stage.tolerance * self.scale, self.keeps and self.solved > self.REBUILD_RATIO * before
+        self.keeps = self.solved <= Friction.ROUNDING * self.system.floor or (self.solved <= near and not is_slow)
+        return self.keeps
 
     def _iterate(self) -> bool:
         """Solve for a direction and step along it; return whether the state moved."""
@@ -268,12 +280,14 @@ class Newton:
             return False
         # the laws hold less well than forces are balanced; keeping the impulses separates the two
         self.r, self.scale = system.end_linearised(new_multipliers=OF_IMPULSES if found.direct else TO_IMPULSES)
+        self.solved = self.r if found.direct and not found.negative else math.inf
         if self.r < accept:
             return True
         system.evaluate(AGAIN, 0.0)
         self.r, self.scale, moved = search(system, accept)
         if not moved:  # nor do the impulses change
             self.r, self.scale = system.end_linearised(accept=False)
+            self.solved = math.inf
         return moved
 
     # --- linearised stages --------------------------------------------------------------------------------------------------

@@ -142,7 +142,7 @@ class StageSystem:
         self.r_scale = 1.0  # R over the r-factors
         self._status = np.zeros(N_SCALARS)  # the scalars of the model's state as they were last read
         self._rejects_direct = False  # whether a direct solve of this stage was rejected: others would be, too
-        self.n_direct = 0  # frictional problems in a row that were solved directly
+        self.n_direct = self.n_in_vain = 0  # frictional problems in a row solved directly, and trials of iterations since
         self._contact_arena = FieldArena()
         self._storage: StageContacts | None = None  # storage for the contacts of this step
         self.contacts = NO_CONTACTS  # of the present stage
@@ -167,7 +167,8 @@ class StageSystem:
 
     def snapshot(self) -> dict:
         """Return what persists between stages: rounding floor, reactions, and the choice of the linear solver."""
-        own = {"residual": self.work.residual.to_numpy(), "linear_solver": self.linear_solver.snapshot(), "direct": self.n_direct}
+        own = {"residual": self.work.residual.to_numpy(), "linear_solver": self.linear_solver.snapshot()}
+        own["direct"] = np.array([self.n_direct, self.n_in_vain])
         return self.rounding.snapshot() | own
 
     def restore(self, kept: dict) -> None:
@@ -175,12 +176,12 @@ class StageSystem:
         self.rounding.restore(kept)
         upload([(self.work.residual, kept["residual"])])
         self.linear_solver.restore(kept["linear_solver"])
-        self.n_direct = int(kept["direct"])
+        self.n_direct, self.n_in_vain = map(int, kept["direct"])
 
     def forget(self) -> None:
         """Discard what was learned of the choice of solvers, after the state was set."""
         self.linear_solver.forget()
-        self.n_direct = 0
+        self.n_direct = self.n_in_vain = 0
 
     def numbers_changed(self) -> None:
         """Update for changed gravity or material numbers."""
@@ -304,6 +305,8 @@ class StageSystem:
     def begin_contacts(self) -> None:
         """Begin the contacts of the step in the present stage."""
         self._allocate_contacts()
+        if self._direct is not None:
+            self._direct.rows_changed()
         self.contacts, stage = self._storage, self.stage
         impact, offset = self.kind == IMPACT, self.step_contacts.contact_offset
         self._may_share = self.model.on_cpu and NODES_PER_CONTACT * self.n_contacts <= self.model.n_nodes

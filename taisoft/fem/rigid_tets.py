@@ -31,6 +31,7 @@ class RigidTets:
     strain: Any  # (n) 9-vectors f64: E_hat
     rate: Any  # (1) f64: 1/beta of the stage [1/s], 0 before the first
     force: Any  # (4 n) 3-vectors f64 [N]: scratch
+    inverse: Any  # (144 n) f64: of each body's block of the system's matrix, see `frame_factors`
 
 
 def model_fields(setup: Setup) -> dict[str, Any]:
@@ -66,6 +67,7 @@ def model_fields(setup: Setup) -> dict[str, Any]:
         strain=arena.vectors("rigid_strain", ti.f64, n, n=9),
         rate=arena.field("rigid_rate", ti.f64, 1),
         force=arena.vectors("rigid_force", ti.f64, len(node)),
+        inverse=arena.field("rigid_inverse", ti.f64, 36 * len(node)),
     )
     return {"has_rigid_tets": True, "rigid_tets": tets}
 
