@@ -38,10 +38,10 @@ class MatrixContacts:
         factor: np.ndarray | None = None,
         limit: float = math.inf,
     ) -> tuple[np.ndarray, SolveResult]:
-        """Return impulses (k,3), from the start r (k,3), and the result; by Newton's method where sweeps do not suffice, or else
-        by an augmented Lagrangian.
+        """Return impulses (k,3), from the start r (k,3), and the result; by sweeps, Newton's method if W is an array, or else by
+        an augmented Lagrangian.
 
-        W: (3k,3k), an array for Newton's method, which is then tried first, too; b: (3k,); friction: (k,); method, tolerance,
+        W: (3k,3k); b: (3k,); friction: (k,); method, tolerance,
         sweeps: as in `contact.solve.solve`; outer: maximum iterations of the augmented Lagrangian. factor, limit: other r-factors
         (k,2), and a bound on the residual with these.
         """
@@ -55,28 +55,26 @@ class MatrixContacts:
             found = residuals(r)
             return found[0] <= tolerance and found[1] <= limit
 
-        def by_newton(r: np.ndarray) -> tuple[np.ndarray, SolveResult] | None:
-            found = semismooth.solve(W, b, friction, r, own, holds, NEAR * tolerance, NEWTON) if is_dense else None
-            return found and (found[0], SolveResult(iterations + found[1], residuals(found[0])[0], True))
-
-        if found := by_newton(r):
-            return found
-        p = self._store(sp.bsr_matrix(W, blocksize=(3, 3)), b, friction, r, method)
-        goal = tolerance
+        p = None
+        if not is_dense:
+            p = self._store(sp.bsr_matrix(W, blocksize=(3, 3)), b, friction, r, method)
+        elif found := semismooth.solve(W, b, friction, r, own, holds, NEAR * tolerance, NEWTON):
+            return found[0], SolveResult(found[1], residuals(found[0])[0], True)
+        goal, result = tolerance, SolveResult(0, math.inf, False)
         for _ in range(1 if factor is None else TIGHTER):
-            result = solve(p, method, goal, sweeps)
-            r, iterations = p.r.to_numpy(len(friction)), iterations + result.iterations
-            if result.converged and holds(r):
-                return r, replace(result, iterations=iterations)
-            if found := by_newton(r):
-                return found
+            if p is not None:
+                result = solve(p, method, goal, sweeps)
+                r, iterations = p.r.to_numpy(len(friction)), iterations + result.iterations
+                if result.converged and holds(r):
+                    break
             if not result.converged:
                 r, history = augmented_lagrangian.solve(sp.csr_matrix(W), b, friction, r, goal, outer)
                 iterations += len(history) - 1
                 result = SolveResult(iterations, history[-1], history[-1] <= goal)
                 if not result.converged or holds(r):
                     break
-                p.r.from_numpy(r, 0)
+                if p is not None:
+                    p.r.from_numpy(r, 0)
             goal *= 0.5 * limit / max(residuals(r)[1], limit)
         return r, replace(result, iterations=iterations)
 

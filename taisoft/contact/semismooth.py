@@ -32,8 +32,7 @@ def solve(
     W: (3k,3k); r: (k,3), the start; b: (3k,); friction: (k,); factor: (k,2), f. near: |F| over |r| below which r may hold.
     """
     k, f = len(friction), factor[:, [0, 1, 1]]
-    scaled, own, one = (f.reshape(-1, 1) * W).reshape(k, 3, 3 * k), np.arange(k), np.eye(3)
-    start = r
+    scaled, start = (f.reshape(-1, 1) * W).reshape(k, 3, 3 * k), r
     for n, shift in enumerate(np.repeat(SHIFTS, most + 1)):
         r = start if n % (most + 1) == 0 else r
         z = r - f * (W @ r.reshape(-1) + b).reshape(-1, 3)
@@ -41,13 +40,18 @@ def solve(
         # rounding may leave r a little outside its cone
         if np.linalg.norm(F) <= near * np.linalg.norm(r) and holds(admissible := prox(r, friction)):
             return admissible, n
-        D = derivative(z, friction)
-        slope = D @ scaled
-        slope.reshape(k, 3, k, 3)[own, :, own, :] += one - (1.0 - shift) * D
+        step, presses = F.copy(), np.flatnonzero(z[:, 0] > 0.0)  # the impulses of others become 0
+        D, own = derivative(z[presses], friction[presses]), np.arange(len(presses))
+        rows = D @ scaled[presses]
+        step[presses] = 0.0
+        rest = F[presses] - rows @ step.reshape(-1)
+        slope = rows.reshape(-1, k, 3)[:, presses].reshape(len(own), 3, len(own), 3)
+        slope[own, :, own, :] += np.eye(3) - (1.0 - shift) * D
         try:
-            r = r - np.linalg.solve(slope.reshape(3 * k, 3 * k), F.reshape(-1)).reshape(k, 3)
+            step[presses] = np.linalg.solve(slope.reshape(rest.size, rest.size), rest.reshape(-1)).reshape(-1, 3)
         except np.linalg.LinAlgError:
             return None
+        r = r - step
     return None
 
 

@@ -146,7 +146,7 @@ def move_directly(m: ti.template(), w: ti.template(), x_hat: ti.template(), beta
 
 
 class Delassus:
-    """W of the contacts of stages of one model."""
+    """W of some contacts of a stage. contacts: (k), in the order of its rows; parts: of Y, one or more for each part of A."""
 
     def __init__(self, model: Model, factor: Factor, nodes: np.ndarray, most: int):
         """nodes (n): those with unknowns, in the order of the factor's blocks; most: maximum number of contacts."""
@@ -166,31 +166,60 @@ class Delassus:
             **{name: arena.field(name, ti.i32, size) for name, size in sizes.items()},
         )
         self._Y = arena.field("Y", ti.f64, 0)
+        self.clear()
 
-    def form(self, p: ContactProblem, active: np.ndarray) -> tuple[list[Part], int]:
-        """Return the parts of Y for active contacts (n_contacts,), and their number k; W has 3 k rows."""
-        w, n = self.unknowns, len(active)
-        number = np.flatnonzero(active)
+    def clear(self) -> None:
+        """Forget the contacts, whose rows or matrix have changed."""
+        none = np.zeros(0, dtype=np.int64)
+        self.contacts, self.parts, self._used = none, [], 0
+        self._blocks = [(none, none, np.zeros((0, 0)))]  # rows and columns of W, and what is added to it there
+
+    def add(self, p: ContactProblem, contacts: np.ndarray) -> None:
+        """Add contacts (k) to those of W."""
+        before, known = len(self.contacts), self.parts
+        self.contacts = np.concatenate([self.contacts, contacts])
+        self.parts = known + (added := self._form(p, contacts, before))
+        for part in added:
+            for other in (one for one in known if one.unknowns == part.unknowns):
+                block = other.Y.T @ part.Y
+                self._blocks += [(other.rows, part.rows, block), (part.rows, other.rows, block.T)]
+            lower = sl.blas.dsyrk(1.0, part.Y.T, lower=1)
+            self._blocks.append((part.rows, part.rows, lower + np.tril(lower, -1).T))
+
+    def _form(self, p: ContactProblem, contacts: np.ndarray, first: int) -> list[Part]:
+        """Return the parts of Y for contacts (k), which are those from `first` on of W."""
+        w, n = self.unknowns, int(p.count[0])
         w.number.host[:n] = NONE
-        w.number.host[number] = np.arange(len(number))
+        w.number.host[contacts] = np.arange(len(contacts))
         _list_contacts(self._model, p, w)
         width = np.diff(w.first.host)
-        ends = np.cumsum(3 * width * w.count.host)
+        ends = self._used + np.cumsum(3 * width * w.count.host)
         w.begin.host[:] = ends - 3 * width * w.count.host
-        if (total := int(ends[-1])) > self._Y.shape[0]:
+        if (total := int(ends[-1])) > self._Y.shape[0]:  # the parts keep the memory of the old one
             self._Y.release()
             self._arena.bytes.pop("Y")
             self._Y = self._arena.field("Y", ti.f64, 2 * total)
-        self._Y.host[:total] = 0.0
+        self._Y.host[self._used : total] = 0.0
         _fill_rows(self._model, p, w, self._Y)
-        found = []
+        found, self._used = [], total
         for k in np.flatnonzero(w.count.host).tolist():
-            unknowns = slice(w.first[k], w.first[k + 1])
             Y = self._Y.host[w.begin[k] : ends[k]].reshape(width[k], -1)
             w.factor.fronts.forward(w.factor.fronts.parts[k], Y)
-            contacts = w.number.host[np.flatnonzero(w.slot.host[k * n : (k + 1) * n] != NONE)]
-            found.append(Part((3 * contacts[:, None] + np.arange(3)).reshape(-1), unknowns, Y))
-        return found, len(number)
+            number = first + w.number.host[np.flatnonzero(w.slot.host[k * n : (k + 1) * n] != NONE)]
+            found.append(Part((3 * number[:, None] + np.arange(3)).reshape(-1), slice(w.first[k], w.first[k + 1]), Y))
+        return found
+
+    def matrix(self, most: int) -> np.ndarray | sp.bsr_matrix:
+        """Return W (3k,3k) of the k contacts, dense if there are at most so many rows."""
+        n = 3 * len(self.contacts)
+        if n <= most:
+            W = np.zeros((n, n))
+            for rows, columns, block in self._blocks:
+                W[rows[:, None], columns] += block
+            return W
+        entries = [(np.repeat(i, len(j)), np.tile(j, len(i)), block.reshape(-1)) for i, j, block in self._blocks]
+        rows, columns, values = (np.concatenate(one) for one in zip(*entries))
+        return sp.coo_matrix((values, (rows, columns)), shape=(n, n)).tobsr((3, 3))
 
     @property
     def field_bytes(self) -> dict[str, int]:
@@ -200,18 +229,3 @@ class Delassus:
     def release(self) -> None:
         """Free the fields."""
         self._arena.release()
-
-
-def assemble(parts: list[Part], k: int, most: int) -> np.ndarray | sp.bsr_matrix:
-    """W (3k,3k) of k contacts, dense if there are at most so many rows."""
-    lower = [sl.blas.dsyrk(1.0, part.Y.T, lower=1) for part in parts]
-    blocks = [one + np.tril(one, -1).T for one in lower]
-    if 3 * k <= most:
-        W = np.zeros((3 * k, 3 * k))
-        for part, block in zip(parts, blocks):
-            W[part.rows[:, None], part.rows] += block
-        return W
-    rows = np.concatenate([np.repeat(part.rows, len(part.rows)) for part in parts])
-    columns = np.concatenate([np.tile(part.rows, len(part.rows)) for part in parts])
-    values = np.concatenate([block.reshape(-1) for block in blocks])
-    return sp.coo_matrix((values, (rows, columns)), shape=(3 * k, 3 * k)).tobsr((3, 3))

@@ -19,7 +19,7 @@ import scipy.sparse as sp
 from taisoft.backend.arrays import download, upload
 from taisoft.contact.matrix_contacts import OUTER, MatrixContacts, jacobian
 from taisoft.dynamics.contact_terms import StageContacts
-from taisoft.dynamics.delassus import Delassus, assemble, begin_direct, end_direct, move_directly
+from taisoft.dynamics.delassus import Delassus, begin_direct, end_direct, move_directly
 from taisoft.fem.model import Model
 from taisoft.fem.state import LAW
 from taisoft.linear.block_csr import BLOCK, BlockCsr
@@ -55,7 +55,6 @@ class DirectSolver:
         self._factor: Factor | None = None
         self._delassus: Delassus | None = None
         self._has_factor = False  # of the present matrix
-        self._formed: tuple | None = None  # active contacts, parts of Y, and W, of that and the present rows
         self._free = np.zeros((0, 3))  # (nodes, 3), 1 on free axes, of the last factor
 
     def matrix_changed(self) -> None:
@@ -65,7 +64,8 @@ class DirectSolver:
 
     def rows_changed(self) -> None:
         """Update for contacts that have changed."""
-        self._formed = None
+        if self._delassus is not None:
+            self._delassus.clear()
 
     def seconds(self, stage_contacts: StageContacts) -> float:
         """Expected duration of a solve with the contacts that have an impulse, infinite if there are too many contacts."""
@@ -138,32 +138,32 @@ class DirectSolver:
         the laws' residual. acceptable: that residual above which a result is rejected, the state kept, and None returned.
         with_residual: whether to measure |r|, which is rounding; else it is 0.
         """
-        m, k, w = self._model, stage_contacts, self._delassus.unknowns
+        m, k, w, delassus = self._model, stage_contacts, self._delassus.unknowns, self._delassus
         p, n = k.problem, int(k.problem.count[0])
         begin_direct(m, k, w, beta)
-        friction, factor, r = download([p.friction, p.factor, k.work.kept], n)
-        start, without = download([k.work.velocity], n)[0], w.factor.rhs.to_numpy()
-        given, impulses = p.r.to_numpy(), np.zeros((n, 3))
-        active, iterations = (r[:, 0] > 0.0) | (start[:, 0] < 0.0), 0
+        friction, factor, r, start = download([p.friction, p.factor, k.work.kept, k.work.velocity], n)
+        given, impulses, without = p.r.to_numpy(), np.zeros((n, 3)), w.factor.rhs.to_numpy()
+        closes, iterations = (r[:, 0] > 0.0) | (start[:, 0] < 0.0), 0
         for _ in range(self.ROUNDS):
+            if len(added := np.setdiff1d(np.flatnonzero(closes), delassus.contacts)):
+                delassus.add(p, added)
             w.factor.rhs.from_numpy(without)
-            if active.any():
-                if self._formed is None or not np.array_equal(self._formed[0], active):
-                    parts, count = self._delassus.form(p, active)
-                    self._formed = active, parts, assemble(parts, count, self.SOFT[0])
-                (_, parts, W), b = self._formed, start[active].reshape(-1)
-                for part in parts:
+            if len(own := delassus.contacts):
+                b = start[own].reshape(-1)
+                for part in delassus.parts:
                     b[part.rows] += part.Y.T @ without[part.unknowns]
-                limits = self.FRACTION * tolerance, *self._limits, factor[active], self.MET * tolerance
-                impulses[active], result = self._contacts.solve(W, b, friction[active], r[active], "gauss_seidel", *limits)
+                limits = self.FRACTION * tolerance, *self._limits, factor[own], self.MET * tolerance
+                given_W = delassus.matrix(self.SOFT[0]), b, friction[own]
+                impulses[own], result = self._contacts.solve(*given_W, r[own], "gauss_seidel", *limits)
                 iterations += result.iterations
-                for part in parts:
-                    w.factor.rhs.host[part.unknowns] += part.Y @ impulses[active].reshape(-1)[part.rows]
+                for part in delassus.parts:
+                    w.factor.rhs.host[part.unknowns] += part.Y @ impulses[own].reshape(-1)[part.rows]
             p.r.from_numpy(impulses, 0)
             end_direct(m, k, w)
-            if not (closes := ~active & (download([k.work.rate], n)[0][:, 0] < 0.0)).any():
+            closes, r = k.work.rate.to_numpy(n)[:, 0] < 0.0, impulses.copy()
+            closes[own] = False
+            if not closes.any():
                 break
-            active, r = active | closes, impulses.copy()
         law_residual = m.state.scalars[LAW]
         if not (self.is_rigid or law_residual <= acceptable):  # also if it is not a number
             upload([(p.r, given)])
