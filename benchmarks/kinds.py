@@ -47,7 +47,7 @@ OF = {  # of packages, modules and functions of taisoft; the longest name that f
     **dict.fromkeys(("collision.detector", "collision.end_search", "collision.intersections"), OTHER),
     "collision.bent_path": PATHS,
     "collision.passages": PATHS,
-    **dict.fromkeys(("dynamics.direct", "dynamics.frame_factors", "dynamics.rigid_balance"), SOLVE),
+    **dict.fromkeys(("dynamics.delassus", "dynamics.frame_factors", "dynamics.rigid_balance"), SOLVE),
     **{f"dynamics.{name}": FRICTION for name in ("contact_terms", "friction", "impact", "linearised")},
     "dynamics.contact_terms.save_diagonal": FORCES,
     **{f"dynamics.{name}": FORCES for name in ("explicit", "explicit_contact", "implicit_stages", "joints", "stage", "state")},
@@ -59,7 +59,7 @@ OF = {  # of packages, modules and functions of taisoft; the longest name that f
 }
 PLACES = (  # the search's own part, and what does dense algebra
     (Detection, "find"),
-    *((DirectSolver, name) for name in ("_analyse", "_factorise", "_find_delassus", "solve", "_imbalance")),
+    *((DirectSolver, name) for name in ("_analyse", "_factorise", "solve", "_imbalance")),
     *((MatrixContacts, "solve"), (linear_solver, "build_hierarchy"), (stage_system, "set_frame_factors")),
 )
 PREPARING = "preparing"  # launches that are watched, once for each kernel: no part of a step

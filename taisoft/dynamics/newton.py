@@ -159,7 +159,9 @@ class Newton:
     def _find_rounding(self) -> None:
         """Find out whether |r| is only rounding after an iteration. Statics continues down to the floor."""
         near = self.r <= (Friction.ROUNDING if self.stage.c > 0.0 else 1.0) * self.system.floor
-        self.rounding = near and self.r > 0.5 * self.previous and (not self.has_rows or self.problems.tight)
+        stalls = self.r > 0.5 * self.previous and (not self.has_rows or self.problems.tight)
+        # a direct solve is tight; what it begins with may be due to new geometry
+        self.rounding = near and (stalls or (self.r == self.solved and self.solved > 0.5 * self.solved_before))
 
     def _passes_checks(self) -> bool:
         """Whether a converged iterate passes all checks. If not, the running problem has changed, or the iterations end."""
@@ -217,8 +219,8 @@ class Newton:
 
     def _keeps_factor(self) -> bool:
         """Whether the next frictional problem takes the factor of the last one, which led near enough."""
-        before, self.solved_before = self.solved_before, self.solved
-        near, is_slow = self.NEAR * self.stage.tolerance * self.scale, self.keeps and self.solved > self.REBUILD_RATIO * before
+        near = self.NEAR * self.stage.tolerance * self.scale
+        is_slow = self.keeps and self.solved > self.REBUILD_RATIO * self.solved_before
         self.keeps = self.solved <= Friction.ROUNDING * self.system.floor or (self.solved <= near and not is_slow)
         return self.keeps
 
@@ -280,7 +282,7 @@ class Newton:
             return False
         # the laws hold less well than forces are balanced; keeping the impulses separates the two
         self.r, self.scale = system.end_linearised(new_multipliers=OF_IMPULSES if found.direct else TO_IMPULSES)
-        self.solved = self.r if found.direct and not found.negative else math.inf
+        self.solved_before, self.solved = self.solved, self.r if found.direct else math.inf
         if self.r < accept:
             return True
         system.evaluate(AGAIN, 0.0)

@@ -13,11 +13,15 @@ from tests.structure.test_source import FILES, PACKAGE, tree
 
 SWEEPS = "sweeps of Gauss-Seidel, in the order of the nodes, are the CPU's preconditioner"
 BANDED = "the preconditioner of nearly incompressible bodies is the CPU's: it solves with a banded matrix"
+DIRECT = "direct solves are the CPU's"
 CPU_ONLY = {  # (file, function): why it does not run on the GPU path, or why it may
     **{("linear/gauss_seidel.py", name): SWEEPS for name in ("iterate_shared", "run_alone", "start", "take_step")},
     ("linear/sweep_order.py", "find_last"): SWEEPS,
     **{("linear/volumes.py", name): BANDED for name in ("apply", "prepare_volumes", "correct_volumes", "step_with_volumes")},
-    **{("linear/factor.py", name): "direct solves are the CPU's" for name in ("apply", "substitute_once")},
+    **{("linear/factor.py", name): DIRECT for name in ("apply", "substitute_once")},
+    **{("dynamics/delassus.py", name): DIRECT for name in ("_list_contacts", "_fill_rows", "begin_direct", "end_direct")},
+    ("dynamics/delassus.py", "move_directly"): DIRECT,
+    ("dynamics/frame_factors.py", "_set_factors"): "the GPU path has the factors of the diagonal",
     ("linear/coarse_correction.py", "correct"): "multigrid is the CPU's, beside Gauss-Seidel",
     ("dynamics/explicit.py", "advance_alone"): "many sub-steps of small models on one CPU thread",
     ("contact/past.py", "enter_past"): "doubles a number until it is large enough",
