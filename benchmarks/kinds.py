@@ -47,7 +47,7 @@ OF = {  # of packages, modules and functions of taisoft; the longest name that f
     **dict.fromkeys(("collision.detector", "collision.end_search", "collision.intersections"), OTHER),
     "collision.bent_path": PATHS,
     "collision.passages": PATHS,
-    **dict.fromkeys(("dynamics.delassus", "dynamics.frame_factors", "dynamics.rigid_balance"), SOLVE),
+    **{f"dynamics.{name}": SOLVE for name in ("delassus", "direct", "frame_factors", "rigid_balance")},
     **{f"dynamics.{name}": FRICTION for name in ("contact_terms", "friction", "impact", "linearised")},
     "dynamics.contact_terms.save_diagonal": FORCES,
     **{f"dynamics.{name}": FORCES for name in ("explicit", "explicit_contact", "implicit_stages", "joints", "stage", "state")},
