@@ -28,7 +28,7 @@ class SharedNodes:
         if descriptor is None:
             descriptor = _anonymous_file()
             os.ftruncate(descriptor, size)
-        self.descriptor, self._memory = descriptor, mmap.mmap(descriptor, size)
+        self.slots, self.descriptor, self._memory = slots, descriptor, mmap.mmap(descriptor, size)
         parts = np.frombuffer(self._memory, np.float32, 4 * slots * n_nodes).reshape(4, slots, n_nodes)
         self.displacement, self.values = parts[:3].reshape(slots, n_nodes, 3), parts[3]
 

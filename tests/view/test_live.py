@@ -48,7 +48,7 @@ class Clock(FakeSimulator):
 class Window:
     """A window that gives requests by the simulator's step count; waiting takes time of its clock. states: what it has got."""
 
-    ready = True
+    ready = has_room = True
 
     def __init__(self, sim, requests=(), steps=None):
         self.sim, self.requests, self.steps, self.states, self.waits = sim, dict(requests), steps, [], []
@@ -199,6 +199,21 @@ def test_commands_are_carried_out_between_steps(live):
         window.requests = {0: commands}
         run.turn()
         assert sim.step_count == steps and run.paused == paused
+
+
+def test_a_state_that_answers_a_drag_waits_for_none_before_it(live):
+    sim = Clock(integrator="implicit_euler")
+    begin = ["begin_drag", "beam", np.array([1]), np.array([1.0])]
+    run, window = live(sim, {3: [begin, ["drag", [1.0, 2.0, 3.0], 10.0]], 6: [["drag", [1.0, 2.0, 4.0], 10.0]]})
+    while sim.step_count < 8:
+        window.ready = sim.step_count < 2
+        window.has_room = sim.step_count < 6
+        run.turn()
+    assert [(state["step_count"], state["drag_done"]) for state in window.states][-1] == (4, 3), "one, and none without room"
+    assert window.states[-2]["step_count"] < 3
+    window.has_room = True
+    run.turn()
+    assert window.states[-1]["drag_done"] == 6
 
 
 def test_failures_pause_and_warnings_are_shown(live):

@@ -3,7 +3,8 @@
 The simulated time is due at speed times the wall time since an anchor. Steps are taken as they become due, never earlier. A
 simulation that falls behind drops what it cannot make up: the anchor moves, so that it never runs faster than asked afterwards.
 Between two steps, or batches of explicit ones no longer than a picture, the commands of the window are carried out, and the state
-is sent if the window has taken the previous one. So the simulation never waits for the window, and the window never for a step.
+is sent if the window has taken the previous one, or if its step has used a drag. So the simulation never waits for the window, and
+the window never for a step.
 
 So that it keeps up, an implicit step gets a budget of wall time (`Simulator.budget`): SHARE of the dt / speed in which
 it is due, less what a state sent after it takes, but at least LEAST_SHARE. The first step has none, nor have single steps, those
@@ -51,7 +52,8 @@ class LiveRun:
         self._compiled = False  # True after a step, since that compiles everything
         self._published = -math.inf  # wall time of the last published state
         self._changed = True  # since that
-        self._drag_request = self._drag_done = 0  # of the last drag: its number, and the last one that a step has used
+        # of the last drag: its number, the last one that a step has used, and that in the last published state
+        self._drag_request = self._drag_done = self._drag_published = 0
         self._measured = {"speed": 0.0, "steps_per_second": 0.0, "cost": 0.0, "on_budget": ""}
         self._start_measuring()
 
@@ -238,19 +240,20 @@ class LiveRun:
     # --- state --------------------------------------------------------------------------------------------------------
 
     def _publish(self, patience: float = 0.0) -> None:
-        """Publish the state if it changed and the window has taken the previous one; patience: how long to wait for that [s].
+        """Publish the state if it changed and the window has taken the previous one; patience: how long to wait for room [s].
 
-        While a drag waits for a step, the next state is that after the step.
+        While a drag waits for a step, the next state is that after the step, which is not kept for the window to take another.
         """
         age = time.perf_counter() - self._published
         # the window would be drawing an earlier state when a step has used its drag
         awaited = not self.paused and self._drag_request > self._drag_done
         due = age > REPEAT or (self._changed and not awaited)
-        if not due or not (self._window.ready or patience):
+        is_answer = self._drag_done > self._drag_published and self._window.has_room
+        if not due or not (self._window.ready or is_answer or patience):
             return
         begin = time.perf_counter()
         self._window.publish(self.sim, self.panel_state(), patience)
-        self._published, self._changed = time.perf_counter(), False
+        self._published, self._changed, self._drag_published = time.perf_counter(), False, self._drag_done
         self._sending = 0.0 if patience else self._published - begin  # without waiting for the window
 
     def panel_state(self) -> dict:

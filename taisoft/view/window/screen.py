@@ -78,6 +78,11 @@ class Screen(SceneView):
         """Whether the mouse drags a body or the view."""
         return bool(self._mode)
 
+    @property
+    def drags_body(self) -> bool:
+        """Whether the mouse drags a body."""
+        return self._drag is not None
+
     def close(self) -> None:
         """Destroy the window; a second call does nothing."""
         self._canvas.close()
@@ -106,7 +111,11 @@ class Screen(SceneView):
         self.timing.shown(state)
         self._read_keys(drawn, size)
         self._read_mouse(drawn, size)
-        self.timing.polled()
+
+    def look(self, drawn: DrawnState) -> None:
+        """Look at the mouse between two pictures, of which the last one showed a state."""
+        self._canvas.window.get_events(ti.ui.RELEASE)  # else buttons stay as they were
+        self._read_mouse(drawn, self._canvas.window.get_window_shape())
 
     def _show_messages(self, gui, state: dict, age: float) -> None:
         """Show what the simulation and this window have to say, in a sub-window that is there only then."""
@@ -193,6 +202,7 @@ class Screen(SceneView):
             self._requests.add("drag", self._drag.target.tolist(), self._panel.strength, key="drag")
             self.timing.dragged(self._requests.next_number)
         self._cursor = cursor
+        self.timing.polled()
 
     def _begin_drag(self, drawn: DrawnState, button, cursor, size) -> str:
         """Start a mouse drag at the cursor and return its mode."""

@@ -37,8 +37,9 @@ class Timing:
         self.latencies: deque[float] = deque(maxlen=KEPT)
         self._polled = time.perf_counter()  # the last look at the mouse
         self._dragged: dict[int, float] = {}  # by request, when its movement may have begun
-        self._asked: tuple[int, float] | None = None  # the first request that no step has used yet, and when it was made
-        self._answer_time = 0.0  # from such a request to the state after its step, the last time [s]
+        self._asked: dict[int, float] = {}  # by request that no step has used yet, when it was made
+        self._used = self._used_in_picture = 0  # last request that a step has used: before the latest state, the last picture
+        self._answer_time = 0.0  # from a request to the state after its step, the last time [s]
 
     def polled(self) -> None:
         """Note that the mouse was looked at."""
@@ -47,23 +48,29 @@ class Timing:
     def dragged(self, request: int) -> None:
         """Note that the mouse has moved since the last look, which a request will tell the simulation."""
         self._dragged.setdefault(request, self._polled)
-        self._asked = self._asked or (request, time.perf_counter())
+        self._asked.setdefault(request, time.perf_counter())
 
     def came(self, state: dict) -> None:
         """Note that a state has come."""
-        if self._asked is not None and self._asked[0] <= state.get("drag_done", 0):
-            self._answer_time, self._asked = time.perf_counter() - self._asked[1], None
+        self._used = state.get("drag_done", 0)
+        for request in [r for r in self._asked if r <= self._used]:
+            self._answer_time = time.perf_counter() - self._asked.pop(request)
 
     def seconds_to_answer(self, limit: float) -> float:
-        """Return for how long to wait for a step that uses a drag [s]: 0 without one, or if the last one exceeded the limit."""
-        if self._asked is None or self._answer_time > limit:
+        """Return for how long a picture may wait for a step that uses a drag [s].
+
+        0 without one, if the latest state already follows such a step that no picture has shown, or if the last one took longer
+        than the limit.
+        """
+        if not self._asked or self._used > self._used_in_picture or self._answer_time > limit:
             return 0.0
-        return max(0.0, self._asked[1] + limit - time.perf_counter())
+        return max(0.0, min(self._asked.values()) + limit - time.perf_counter())
 
     def shown(self, state: dict) -> None:
         """Note that a picture of a state is shown."""
         now = time.perf_counter()
         self.pictures.append(now)
+        self._used_in_picture = state.get("drag_done", 0)
         for request in [r for r in self._dragged if r <= state.get("drag_done", 0)]:
             self.latencies.append(now - self._dragged.pop(request))
 

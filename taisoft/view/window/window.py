@@ -23,6 +23,7 @@ from taisoft.view.window.live import LiveRun
 FAILURE = "cannot open a window"
 START_SECONDS = 60.0  # in which the window must open
 FPS = 60.0  # of the window's pictures, at most
+SLOTS = 3  # states that the window need not have taken yet: it shows the last
 CHILD = ("-P", "-m", "taisoft.view.window.window_process")
 
 
@@ -52,7 +53,7 @@ class WindowProcess(Viewer):
         self._closed, self.timing = False, {}
         description = {"fps": FPS, "colour": colour, "layers": list(layers)}
         description |= {"controls": controls, "pairs": touching_pairs(sim) if controls else []}
-        super().__init__(child or CHILD, self._sampler.drawn, description, FAILURE)
+        super().__init__(child or CHILD, self._sampler.drawn, description, FAILURE, SLOTS)
         try:
             if self.read(START_SECONDS) is None:
                 raise OutputError(f"{FAILURE}: its process does not answer within {START_SECONDS:g} s")
@@ -70,6 +71,11 @@ class WindowProcess(Viewer):
     def ready(self) -> bool:
         """Whether the window has taken the last state."""
         return self._confirmed >= self._sent
+
+    @property
+    def has_room(self) -> bool:
+        """Whether one more state can be sent."""
+        return self._sent - self._confirmed < SLOTS
 
     def receive(self, timeout: float = 0.0) -> list[tuple[int, list]]:
         """Return the requests since the last call, each a number and its commands; wait up to a time [s] for the first message.
@@ -97,18 +103,18 @@ class WindowProcess(Viewer):
         return True
 
     def publish(self, sim, shown: dict, patience: float = 0.0) -> None:
-        """Send sim's present state, unless the window does not take the previous one within a time [s].
+        """Send sim's present state, unless there is no room for it within a time [s].
 
         shown: what else the window shows, see `LiveRun.panel_state`.
         Raises OutputError as `receive`, and if a path fails.
         """
         end = time.perf_counter() + patience
-        while not self.ready and not self.closed and (left := end - time.perf_counter()) > 0.0:
+        while not self.has_room and not self.closed and (left := end - time.perf_counter()) > 0.0:
             self._take(left)
-        if not self.ready or self.closed:
+        if not self.has_room or self.closed:
             return
-        state = self.nodes.put(self._sampler.state(sim, self._layers, [self._colour]), self._colour)
         self._sent += 1
+        state = self.nodes.put(self._sampler.state(sim, self._layers, [self._colour]), self._colour, self._sent % SLOTS)
         if not self.send({"state": state, "number": self._sent, "answered": self._answered} | shown):
             while self._take(0.0):  # it may have been closed by its user
                 pass
@@ -144,7 +150,8 @@ class LiveWindow(Observer):
         """Show sim's present state if the window has shown the previous one."""
         try:
             self._window.receive()
-            self._window.publish(sim, {"status": f"frame {sim.step_count if index is None else index}", "messages": []})
+            if self._window.ready:
+                self._window.publish(sim, {"status": f"frame {sim.step_count if index is None else index}", "messages": []})
         except OutputError as error:
             warnings.warn(f"{error}; the run continues without it", UserWarning, stacklevel=2)
 

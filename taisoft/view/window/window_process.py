@@ -14,7 +14,8 @@ from taisoft.view.window.screen import Screen
 
 MAX_UNANSWERED = 64  # requests; later commands wait, so that a long step lets no queue grow
 IDLE_SHARE = 1.0  # time without drawing over that of drawing: with software Vulkan, drawing takes cores from the simulation
-ANSWER = 1.0 / 40.0  # time for which a picture may wait for the step that uses a drag, or as long as the last one took [s]
+ANSWER = 0.1  # time for which a picture may wait for the step that uses a drag [s]
+LOOK_EVERY = 0.003  # time between two looks at the mouse while a drag waits for its next picture [s]
 SLOWEST = 1.0 / 25.0  # time between two pictures above which there is no such pause [s]
 
 
@@ -48,15 +49,18 @@ class View:
         self._link.send({"closed": True, "pictures": list(timing.pictures), "latencies": list(timing.latencies)})
 
     def _wait(self, begin: float, end: float) -> None:
-        """Take over states until the next picture is due; begin, end: of the last one [s]."""
+        """Take over states, and follow a drag, until the next picture is due; begin, end: of the last one [s]."""
         idle = 0.0 if self._screen.dragging else IDLE_SHARE * (end - begin)
         due = max(begin + self._interval, min(end + idle, begin + SLOWEST))
-        while (left := due - time.perf_counter()) > 0.0:
-            self._receive(left)
+        timing = self._screen.timing
         # a drag that has no effect in the next picture has to wait for the one after it
-        limit = max(ANSWER, end - begin)
-        while (left := self._screen.timing.seconds_to_answer(limit)) > 0.0:
-            self._receive(left)
+        while (left := max(due - time.perf_counter(), timing.seconds_to_answer(ANSWER))) > 0.0:
+            if self._screen.drags_body:
+                self._receive(min(left, LOOK_EVERY))
+                self._screen.look(self._drawn)
+                self._send()
+            else:
+                self._receive(left)
         self._receive(0.0)
 
     def _receive(self, timeout: float | None) -> None:
@@ -64,7 +68,7 @@ class View:
         while (message := self._link.receive(timeout)) is not None:
             timeout = 0.0
             self._state, self._came = message, time.perf_counter()
-            self._drawn = self._nodes.take(self._scene, message["state"])
+            self._drawn = self._nodes.take(self._scene, message["state"], message["number"] % self._nodes.slots)
             self._screen.timing.came(message)
             self._send()  # at once, so that the simulation may send the next one
 
