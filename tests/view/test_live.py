@@ -156,6 +156,10 @@ def test_an_implicit_step_gets_a_budget_of_the_time_in_which_it_is_due(live):
     assert budgets[5] == pytest.approx(0.8 * 0.01 - 0.6 * 1e-3), (
         "four fifths of dt, less a state's time for dt of a 60th of a second"
     )
+    sim.dragged = "a body"
+    assert run._budget() is None, "as fast as possible"
+    run._on_unbound()
+    assert run._budget() == pytest.approx(0.4 * 0.01 - 0.6 * 1e-3), "half, so that the drag shows sooner"
     assert budgets[15] == pytest.approx(0.8 * 0.02 - 1e-3) and budgets[25] == budgets[45] == pytest.approx(budgets[5])
     assert budgets[35] is None and budgets[55] is None and sim.budget is None
     assert [state["budget"] for state in window.states if state["step_count"] == 35] == [False]

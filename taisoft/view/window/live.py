@@ -6,9 +6,10 @@ Between two steps, or batches of explicit ones no longer than a picture, the com
 is sent if the window has taken the previous one, or if its step has used a drag. So the simulation never waits for the window, and
 the window never for a step.
 
-So that it keeps up, an implicit step gets a budget of wall time (`Simulator.budget`): SHARE of the dt / speed in which
-it is due, less what a state sent after it takes, but at least LEAST_SHARE. The first step has none, nor have single steps, those
-as fast as possible and those after the user has switched it off; one that the simulator has of its own counts instead.
+So that it keeps up, an implicit step gets a budget of wall time (`Simulator.budget`): SHARE of the dt / speed in which it is due,
+DRAG_SHARE while a body is dragged, less what a state sent after it takes, but at least LEAST_SHARE. The first step has none, nor
+have single steps, those as fast as possible and those after the user has switched it off; one that the simulator has of its own
+counts instead.
 """
 
 import math
@@ -26,7 +27,7 @@ from taisoft.view.window.timing import Note
 BATCH = 1.0 / 60.0  # longest wall time of a batch of explicit steps [s]
 ARREARS = 0.05  # of simulated time at unit speed that a simulation makes up [s]
 SPEED_WINDOW = 0.5  # wall time over which speeds are measured [s]
-SHARE, LEAST_SHARE = 0.8, 0.2  # see above
+SHARE, DRAG_SHARE, LEAST_SHARE = 0.8, 0.4, 0.2  # see above
 SLOW = 1.1  # wall time over simulated time above which the solver counts as too slow
 MAX_SPEED = 16.0
 PATIENCE = 1.0  # longest wait for the window before what takes long [s]
@@ -113,8 +114,8 @@ class LiveRun:
             return self._own_budget if self._is_budgeted else None
         if not (is_due and self.sim.settings.tolerance is None):
             return None
-        due = self.sim.dt / self.speed
-        return max(LEAST_SHARE * due, SHARE * due - self._sending * min(1.0, due / BATCH))
+        due, share = self.sim.dt / self.speed, SHARE if self.sim.dragged is None else DRAG_SHARE
+        return max(LEAST_SHARE * due, share * due - self._sending * min(1.0, due / BATCH))
 
     def _take(self, n: int) -> None:
         self.sim.budget = self._budget()
