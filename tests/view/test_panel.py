@@ -195,13 +195,14 @@ def test_latency_counts_from_the_last_look_that_saw_nothing(monkeypatch):
             timing.dragged(7)
         timing.polled()
     assert list(timing.latencies) == [pytest.approx(0.02 * (8 - 4))]
-    assert timing.seconds_to_answer(1.0) == pytest.approx(0.9), "the state has not come"
+    assert timing.seconds_to_answer(8, 1.0) == pytest.approx(0.9), "the state has not come"
     timing.dragged(8)
-    timing.came({"drag_done": 7})
-    assert timing.seconds_to_answer(1.0) == pytest.approx(1.0), "it shows nothing new"
-    timing.came({"drag_done": 8})
     timing.dragged(9)
-    assert timing.seconds_to_answer(1.0) == 0.0, "the state at hand does"
+    timing.came({"drag_done": 7})
+    assert timing.awaited(is_fast=False) == 8 and timing.seconds_to_answer(8, 1.0) == pytest.approx(1.0), "any that is new"
+    assert timing.awaited(is_fast=True) == 9, "slow pictures show all"
+    timing.came({"drag_done": 8})
+    assert timing.seconds_to_answer(8, 1.0) == 0.0 < timing.seconds_to_answer(9, 1.0)
     measured = {"speed": 0.5, "asked_speed": 2.0, "steps_per_second": 30.0}
     speed, solver, pictures = timing.lines(measured | {"on_budget": "on budget: 3 of 9 steps, residual 0.02"})
     assert solver == "solver   on budget: 3 of 9 steps, residual 0.02"

@@ -2,9 +2,9 @@
 
 The simulated time is due at speed times the wall time since an anchor. Steps are taken as they become due, never earlier. A
 simulation that falls behind drops what it cannot make up: the anchor moves, so that it never runs faster than asked afterwards.
-Between two steps, or batches of explicit ones no longer than a picture, the commands of the window are carried out, and the state
-is sent if the window has taken the previous one, or if its step has used a drag. So the simulation never waits for the window, and
-the window never for a step.
+Between two steps, or batches of explicit ones no longer than a picture, the commands of the window are carried out, and the
+state is sent if the window has taken the previous one, or if its step has used a drag. So the simulation never waits for the
+window, and the window for a step only a moment, while a body is dragged.
 
 So that it keeps up, an implicit step gets a budget of wall time (`Simulator.budget`): SHARE of the dt / speed in which it is due,
 DRAG_SHARE while a body is dragged, less what a state sent after it takes, but at least LEAST_SHARE. The first step has none, nor

@@ -39,7 +39,6 @@ class Timing:
         self._dragged: dict[int, float] = {}  # by request, when its movement may have begun
         self._asked: dict[int, float] = {}  # by request that no step has used yet, when it was made
         self._used = self._used_in_picture = 0  # last request that a step has used: before the latest state, the last picture
-        self._answer_time = 0.0  # from a request to the state after its step, the last time [s]
 
     def polled(self) -> None:
         """Note that the mouse was looked at."""
@@ -53,16 +52,22 @@ class Timing:
     def came(self, state: dict) -> None:
         """Note that a state has come."""
         self._used = state.get("drag_done", 0)
-        for request in [r for r in self._asked if r <= self._used]:
-            self._answer_time = time.perf_counter() - self._asked.pop(request)
+        self._asked = {request: begin for request, begin in self._asked.items() if request > self._used}
 
-    def seconds_to_answer(self, limit: float) -> float:
-        """Return for how long a picture may wait for a step that uses a drag [s].
+    def awaited(self, is_fast: bool) -> int:
+        """Return the request whose effect the next picture awaits: the first one that no picture has shown.
 
-        0 without one, if the latest state already follows such a step that no picture has shown, or if the last one took longer
-        than the limit.
+        is_fast: whether a step takes less time than a picture; then the last one, which would have to wait for all of the next
+        picture.
         """
-        if not self._asked or self._used > self._used_in_picture or self._answer_time > limit:
+        return max(self._asked, default=0) if is_fast else self._used_in_picture + 1
+
+    def seconds_to_answer(self, request: int, limit: float) -> float:
+        """Return for how long a picture may wait for a step that uses a request [s].
+
+        limit: from the first request that no step has used.
+        """
+        if not self._asked or self._used >= request:
             return 0.0
         return max(0.0, min(self._asked.values()) + limit - time.perf_counter())
 

@@ -15,6 +15,7 @@ from taisoft.view.window.screen import Screen
 MAX_UNANSWERED = 64  # requests; later commands wait, so that a long step lets no queue grow
 IDLE_SHARE = 1.0  # time without drawing over that of drawing: with software Vulkan, drawing takes cores from the simulation
 ANSWER = 0.1  # time for which a picture may wait for the step that uses a drag [s]
+STEPS_TO_ANSWER = 1.5  # half of the present one, and the next
 LOOK_EVERY = 0.003  # time between two looks at the mouse while a drag waits for its next picture [s]
 SLOWEST = 1.0 / 25.0  # time between two pictures above which there is no such pause [s]
 
@@ -53,8 +54,9 @@ class View:
         idle = 0.0 if self._screen.dragging else IDLE_SHARE * (end - begin)
         due = max(begin + self._interval, min(end + idle, begin + SLOWEST))
         timing = self._screen.timing
-        # a drag that has no effect in the next picture has to wait for the one after it
-        while (left := max(due - time.perf_counter(), timing.seconds_to_answer(ANSWER))) > 0.0:
+        self._receive(0.0)
+        request = timing.awaited(is_fast=self._seconds_to_answer() < end - begin)
+        while (left := max(due - time.perf_counter(), timing.seconds_to_answer(request, ANSWER))) > 0.0:
             if self._screen.drags_body:
                 self._receive(min(left, LOOK_EVERY))
                 self._screen.look(self._drawn)
@@ -62,6 +64,10 @@ class View:
             else:
                 self._receive(left)
         self._receive(0.0)
+
+    def _seconds_to_answer(self) -> float:
+        """Return the expected time from a request to the state after a step that uses it [s]; 0 without controls."""
+        return STEPS_TO_ANSWER * self._state["cost"] * self._state["controls"]["dt"] if "cost" in self._state else 0.0
 
     def _receive(self, timeout: float | None) -> None:
         """Take over all states that have come; wait up to a time [s] for the first."""
