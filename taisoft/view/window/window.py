@@ -173,12 +173,12 @@ def show(
 ) -> None:
     """Run a simulation in a window until it is closed, following the clock.
 
-    sim: an open Simulator; if made with draggable=True, its bodies can be dragged with the mouse. fps: dt is lowered to a divisor
-    of 1/fps as by `run`; None keeps dt. speed: simulated over wall time, `math.inf` for as fast as possible. budget: end implicit
-    steps before they are solved where they would fall behind the clock (`Simulator.budget`); a simulator's own budget counts
-    instead. If no step ends so, and without a drag, the states are those of `run`, bit by bit. A failed step pauses the run and
-    the reason is shown; R restarts. colour, layers: initial ones. Raises OutputError, before anything is opened, if a display or
-    a Vulkan driver is missing, and if the window's process is lost.
+    sim: an open Simulator; if made with draggable=True, its bodies can be dragged with the mouse. fps: dt is lowered to a
+    divisor of 1/fps as by `run`; None keeps dt. speed: simulated over wall time, `math.inf` for as fast as possible. budget:
+    end implicit steps before they are solved where they would fall behind the clock, or delay a drag (`Simulator.budget`); a
+    simulator's own budget counts instead. If no step ends so, and without a drag, the states are those of `run`, bit by bit. A
+    failed step pauses the run and the reason is shown; R restarts. colour, layers: initial ones. Raises OutputError, before
+    anything is opened, if a display or a Vulkan driver is missing, and if the window's process is lost.
     """
     if fps is not None and not fps > 0:
         raise OutputError(f"the window's fps is {fps}; it must be positive")
