@@ -32,7 +32,7 @@ from taisoft.settings import NAMES, Settings, plan_of
 if TYPE_CHECKING:
     from taisoft.simulator import Simulator
 
-KIND, FORMAT = "taisoft checkpoint", 27  # increment FORMAT with every change of a file's content
+KIND, FORMAT = "taisoft checkpoint", 28  # increment FORMAT with every change of a file's content
 PARTS = ("settings", "numbers", "start", "fingerprint", "state", "notes")  # of the header, each a table
 
 

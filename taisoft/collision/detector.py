@@ -421,6 +421,10 @@ class Detection:
         which they are apart, or None, see `PathCheck.find`."""
         return self.paths.find(self.model.state.x, self._broad_result, self._near_buffer, mode, also)
 
+    def list_near(self) -> None:
+        """List the near pairs of the last search for checks of paths in a batch."""
+        self.paths.prepare_batch(self.model.state.x, self._broad_result, self._near_buffer)
+
     def bends(self, mode: int) -> bool:
         """Return whether a bent path is free instead of a straight one of that mode."""
         return self.paths.bends(self.model.state.x, self._broad_result, self._near_buffer, mode, self.margin)

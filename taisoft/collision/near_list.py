@@ -18,9 +18,11 @@ import taichi as ti
 
 from taisoft.backend.arrays import Count
 from taisoft.backend.lists import part_first
+from taisoft.backend.runtime import kernel
+from taisoft.collision.features import unit
 from taisoft.collision.surface import ACTIVE, dvec, may_meet
 
-SEARCHED, TO_STATE, STILL, GIVEN = range(4)  # which paths are checked
+SEARCHED, TO_STATE, STILL, GIVEN, ONWARD = range(5)  # which paths are checked; ONWARD: to the state, from another one since
 HINTS = 16  # planes stored per triangle
 UNCOVERED, OUTDATED = range(2)  # indices into PathFields.left
 
@@ -39,7 +41,8 @@ class PathFields:
     left: Any  # (2) i32: 1 if paths leave what was searched (UNCOVERED), or if the list is of no use for them (OUTDATED)
     lo: Any  # (2 n_triangles) vectors: boxes of active triangles at the start and the end, grown by half the floor; else, and
     hi: Any  # between checks, the first component of lo is infinite, so that they overlap nothing
-    low: Any  # (2 n_triangles) f64: ranges of their heights along their first normals [m], likewise, grown by the floor
+    normal: Any  # (n_triangles) vectors: their normals halfway
+    low: Any  # (2 n_triangles) f64: ranges of their heights along these normals [m], likewise, grown by the floor
     high: Any
     plane: Any  # (HINTS n_triangles) i32: of pairs of triangles, the plane that last separated them, see `hint_of`
     exempt: Any  # (n_bodies^2) i32: 1 for pairs of colliders that cross already
@@ -61,16 +64,38 @@ def _set_paths(surface: ti.template(), x: ti.template(), paths: ti.template(), m
             path = paths.path[i]
         elif mode == STILL:
             path = dvec(0.0)
-        elif mode == TO_STATE and surface.node[i] >= 0:
+        elif (mode == TO_STATE or mode == ONWARD) and surface.node[i] >= 0:
             path = x[surface.node[i]] - surface.x[i]
-            change = path - surface.move[i]
+            since = path
+            if ti.static(paths.has_pairs):
+                if mode == ONWARD:
+                    since = x[surface.node[i]] - paths.listed_x[i]
+            change = since - surface.move[i]
             if not change.dot(change) <= limit * limit:  # cheaper, and mostly enough; also if it is not a number
-                if not leaving(path, surface.move[i]).norm() <= limit:
+                if not leaving(since, surface.move[i]).norm() <= limit:
                     paths.left[UNCOVERED] = 1
         paths.path[i] = path
         if ti.static(paths.has_pairs):
             if is_new:
                 paths.listed_x[i], paths.listed_move[i] = surface.x[i], surface.move[i]
+
+
+@kernel
+def begin_onward(s: ti.template(), x: ti.template(), paths: ti.template()):
+    """Store the searched paths, of which a new list is, then see `go_onward`."""
+    ti.loop_config(serialize=s.serial_cheap)
+    for i in range(s.n_verts):
+        paths.listed_x[i], paths.listed_move[i] = s.x[i], s.move[i]
+    go_onward(s, x, 1)
+
+
+@ti.func
+def go_onward(s: ti.template(), x: ti.template(), go):
+    """Place the soft bodies at x (n_nodes) [m], where the next path ONWARD begins, if go is 1. A top-level loop of a kernel."""
+    ti.loop_config(serialize=s.serial_cheap)
+    for i in range(go * s.n_verts):
+        if s.node[i] >= 0:
+            s.x[i] = x[s.node[i]]
 
 
 @ti.func
@@ -88,11 +113,14 @@ def _box_ends(s: ti.template(), g: ti.template(), floor):
     ti.loop_config(serialize=s.serial_cheap)
     for e in range(s.count[ACTIVE]):
         t = s.active[e]
-        n, i, j, k = s.normal[t], s.triangle[t, 0], s.triangle[t, 1], s.triangle[t, 2]
+        i, j, k = s.triangle[t, 0], s.triangle[t, 1], s.triangle[t, 2]
         for v in ti.static((i, j, k)):
             g.can_touch[v] = 1
         a0, b0, c0 = s.x[i], s.x[j], s.x[k]
         a1, b1, c1 = a0 + g.path[i], b0 + g.path[j], c0 + g.path[k]
+        a2, b2, c2 = a0 + a1, b0 + b1, c0 + c1
+        n = unit((b2 - a2).cross(c2 - a2))
+        g.normal[t] = n
         for end in ti.static(range(2)):
             a, b, c = ti.static(((a0, b0, c0), (a1, b1, c1))[end])
             p, q, r = a.dot(n), b.dot(n), c.dot(n)
@@ -162,8 +190,8 @@ def prepare_paths(surface: ti.template(), x: ti.template(), paths: ti.template()
 
 @ti.func
 def _is_beyond(s: ti.template(), g: ti.template(), own, other):
-    """1 if all corners of triangle `other` are above or below `own` at both ends, along the first normal of `own`."""
-    n, above, below = s.normal[own], 1, 1
+    """1 if all corners of triangle `other` are above or below `own` at both ends, along the normal of `own` halfway."""
+    n, above, below = g.normal[own], 1, 1
     for k in ti.static(range(3)):
         i = s.triangle[other, k]
         now = s.x[i].dot(n)
@@ -182,7 +210,7 @@ def hint_of(t, u):
 @ti.func
 def list_unseparated(s: ti.template(), g: ti.template(), near: ti.template(), c):
     """List, in the last components of the first entries of part c, the entries whose triangles are not separated by a plane
-    across an axis, nor by the first plane of either. Return their number.
+    across an axis, nor by the plane of either halfway. Return their number.
 
     No branch depends on whether a pair is separated: that is hard to predict, and mispredicted branches would take longest.
     """

@@ -257,7 +257,8 @@ def check_paths(
     event: ti.i32,
 ):
     """Find the passages on the paths to the positions x (n_nodes) [m] (TO_STATE), on the searched ones (SEARCHED), on those given
-    (GIVEN), or where surfaces are already, half-spaces left out (STILL).
+    (GIVEN), or where surfaces are already, half-spaces left out (STILL). ONWARD: as TO_STATE, from positions s.x that are on the
+    way since the search, at which the near pairs were listed.
 
     near: listed pairs. begin, end: parts of the step between which obstacles move. limit, listed_limit [m]: see `prepare_paths`;
     beyond them, nothing is checked. floor [m]: to be kept. event: number of the event that ends a batch if paths are not known to

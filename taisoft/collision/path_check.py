@@ -14,7 +14,18 @@ from taisoft.collision.bent_path import TRIALS, find_inwards, set_leg
 from taisoft.collision.bvh import Trees
 from taisoft.collision.candidates import Buffer, Pairs, fill, list_pairs, pair_entries
 from taisoft.collision.colliders import Topology
-from taisoft.collision.near_list import GIVEN, HINTS, OUTDATED, SEARCHED, STILL, TO_STATE, UNCOVERED, PathFields
+from taisoft.collision.near_list import (
+    GIVEN,
+    HINTS,
+    ONWARD,
+    OUTDATED,
+    SEARCHED,
+    STILL,
+    TO_STATE,
+    UNCOVERED,
+    PathFields,
+    begin_onward,
+)
 from taisoft.collision.passages import ADJACENT, FLAT, N_KINDS, NEAR, ROUND, check_paths, passage_fields
 from taisoft.collision.surface import Surface, integers
 from taisoft.ranges import expand
@@ -89,7 +100,7 @@ class PathCheck:
         n_listed = s.n_triangles if has_pairs else 0
         triangle_ends = max(2 * n_listed, 1)
         lengths = {"path": n} | dict.fromkeys(("listed_x", "listed_move"), n if has_pairs else 1)
-        lengths |= dict.fromkeys(("left_lo", "left_hi"), 2 * s.n_bodies) | {"hi": triangle_ends}
+        lengths |= dict.fromkeys(("left_lo", "left_hi"), 2 * s.n_bodies) | {"hi": triangle_ends, "normal": max(n_listed, 1)}
         self.fields = PathFields(
             **{name: arena.vectors(f"path_{name}", ti.f64, length) for name, length in lengths.items()},
             lo=arena.vectors("path_lo", ti.f64, triangle_ends, np.full((triangle_ends, 3), np.inf)),
@@ -232,10 +243,17 @@ class PathCheck:
                 break
         return self._read()
 
+    def prepare_batch(self, x, broad, row: Buffer | None) -> None:
+        """List the near pairs of the last search, unless they are listed, and place the surface at x [m], where batches go on."""
+        if broad is not None and not self._is_listed:
+            self._list(broad, row)
+            begin_onward(self.surface, x, self.fields)
+
     def check_in_batch(self, x, event: int) -> None:
-        """Check the paths to positions x [m] in a scene without pairs of triangles. event: see `check_paths`."""
-        lists, limits = (self.near.parts, self.passages.parts), (np.inf, np.inf, self.floor)
-        check_paths(self.surface, x, self.shapes, self.fields, *lists, TO_STATE, 0.0, 1.0, *limits, event)
+        """Check the paths to positions x [m] from those of the surface. event: see `check_paths`."""
+        lists, has_pairs = (self.near.parts, self.passages.parts), self.fields.has_pairs
+        mode, limits = (ONWARD, (self.limit, np.finfo(float).max)) if has_pairs else (TO_STATE, (np.inf, np.inf))
+        check_paths(self.surface, x, self.shapes, self.fields, *lists, mode, 0.0, 1.0, *limits, self.floor, event)
 
     def _read(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the passages found."""

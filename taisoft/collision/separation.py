@@ -247,13 +247,13 @@ def separating_plane(a0, b0, c0, e0, f0, a1, b1, c1, e1, f1, need, first, tried)
 
     0: across an axis; 1: between their middles; 2, 3: that of def, of abc, at the start; 4, 5: the same, moving along; 6 to 14:
     along an edge of each at the start, numbered as in `nearest_of`. first: the number to be tried first, since one plane mostly
-    serves for many steps; whether there is one does not depend on it. tried: 1 to skip 0, 2 and 3, which are then known to fail.
+    serves for many steps; whether there is one does not depend on it. tried: 1 to skip 0, which is then known to fail.
     """
     found, k = -1, 0
     while k < N_PLANES and found < 0:
         plane = ti.select(k == 0, first, ti.select(k > first, k, k - 1))
         separates = False
-        if tried == 1 and (plane == 0 or plane == 2 or plane == 3):
+        if tried == 1 and plane == 0:
             pass
         elif plane == 0:
             separates = _axis_separates(a0, b0, c0, e0, f0, a1, b1, c1, e1, f1, need)

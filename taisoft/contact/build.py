@@ -292,6 +292,15 @@ def fill(
 
 
 @kernel
+def carry_on(p: ti.template(), m: ti.template(), s: ti.template(), dt: ti.f64, common_offset: ti.f64):
+    """Begin a sub-step of dt [s] with the contacts and impulses of the last one, as `fill` does with those of a search."""
+    keep_impulses(p, common_offset, s.run[GO])
+    ti.loop_config(serialize=p.serial)
+    for c in range(s.run[GO] * p.count[0]):
+        p.approach[c], p.load[c] = p.normal[c].dot(relative_velocity(p, m, c, dt)), load_of(p, c)
+
+
+@kernel
 def has_impact(p: ti.template(), rigid: ti.template(), dt: ti.f64, contact_offset: ti.f64) -> ti.i32:
     """Return 1 if a contact without impulse in the previous step closes within a step of dt, else 0.
 

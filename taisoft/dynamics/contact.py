@@ -34,6 +34,7 @@ from taisoft.dynamics.misplaced import NO_SUMS, Misplacement
 from taisoft.dynamics.part_length import PARTS
 from taisoft.dynamics.readout import (
     MORE_ROWS,
+    ROWS,
     ContactRows,
     Pairs,
     join_contacts,
@@ -49,6 +50,7 @@ from taisoft.dynamics.readout import (
 )
 from taisoft.dynamics.rebounds import Rebounds
 from taisoft.dynamics.renewal import Renewal
+from taisoft.dynamics.search_ahead import MOST, SearchAhead
 from taisoft.dynamics.simulation_state import SimulationState
 from taisoft.dynamics.state import StepState
 from taisoft.dynamics.surface_loads import ContactPressure, SurfaceLoads
@@ -82,6 +84,7 @@ class ContactStep:
         self.measures = ContactMeasures(self.detection, self._lasting)
         self.paths = ContactPaths(simulation, self.detection, self._lasting)
         self.misplaced = Misplacement(simulation, self.detection)
+        self.ahead = SearchAhead(simulation, self._lasting) if explicit else None
         self.far = FarApart(simulation, self.detection)
         detection = self.detection
         is_flat = detection.overlay is None and all(isinstance(one.shape, HalfSpace) for one in scene.obstacles)
@@ -105,6 +108,7 @@ class ContactStep:
         self._surface_loads = SurfaceLoads(simulation)
         self._asleep: AsleepContacts | None = None  # those of sleeping bodies, which `problem` lacks
         self._searched: tuple[float, float] | None = None  # time and dt of the valid search
+        self._is_near = False  # whether it found anything near
         self._measured_end: tuple[float, float] | None = None  # time and dt of the measured end, until the next substep begins
         self._depth = 0.0  # deepest penetration there [m]
         self.crossing: float | None = None  # depth of crossing triangles over the finer side's edge; None: not measured
@@ -151,7 +155,7 @@ class ContactStep:
     def motion_changed(self) -> None:
         """Discard the search, after an obstacle or nodes were commanded to move."""
         self._searched = None
-        self.far.forget()
+        self._forget_ahead()
 
     @property
     def n_contacts(self) -> int:
@@ -180,12 +184,13 @@ class ContactStep:
         now.held, self._asleep = NO_PASSAGES, None
         self.misplaced.start_step()
         self.paths.forget()
-        self._is_fast = False
+        self.far.restore({})
+        self._is_fast = self._is_near = False
 
     def discard_search(self, with_impulses: bool) -> None:
         """Discard the search of a substep that was undone; the impulses that are left warm-start the next attempt."""
         self._searched = self._measured_end = None
-        self.far.forget()
+        self._forget_ahead()
         if with_impulses:
             self.problem.count[0], self._last_time, self._search_counts, self._renewal.sides = 0, 0.0, (0, 0), None
             self._n_contacts = 0
@@ -193,8 +198,10 @@ class ContactStep:
     def snapshot(self) -> dict:
         """Return the last step's contacts and impulses, and the capacities: a step that exceeds them starts without impulses.
 
-        The search is not included: from the same state the next one finds the same contacts in the same order.
+        The search is not included: from the same state the next one finds the same contacts in the same order. Nor is one that
+        serves several sub-steps, but for its state.
         """
+        ahead = {} if self.ahead is None else self.ahead.snapshot()
         return {
             "capacity": self.problem.capacity,
             "entries": self.problem.node.shape[0],
@@ -209,7 +216,10 @@ class ContactStep:
             "dropped": self.dropped,
             "found": self._search_counts[0],
             "unmapped": self._search_counts[1],
-            "rows": read_rows(self.problem),
+            "rows": read_rows(self.problem, MORE_ROWS if ahead else ROWS),
+            "ahead": ahead,
+            "far": self.far.snapshot(),
+            "near": self._is_near,
             "sides": list(self._renewal.sides or ()),
             "asleep": {} if self._asleep is None else self._asleep.rows,
             "asleep_sides": [] if self._asleep is None else list(self._asleep.sides or ()),
@@ -233,8 +243,14 @@ class ContactStep:
         self.misplaced.start_step()
         self.crossing, self.last_crossing = 0.0 if self.paths.none_cross else None, Crossing()
         self._searched = self._measured_end = None
-        self.far.forget()
+        self._is_near = bool(kept["near"])
+        self.far.restore(kept["far"])
+        if self.ahead is not None:
+            self.ahead.restore(kept["ahead"])
         self._indexed = True  # so that the next step rebuilds the node index, even without contacts
+        if kept["ahead"]:
+            index_nodes(self.problem)
+            self.problem.sweep.order.from_numpy(np.arange(self.n_contacts), 0)
 
     def _gap_targets(self) -> tuple[float, float, float, float]:
         """Contact offset [m]; fractions of a penetration and of a missing offset corrected per substep; maximum speed [m/s]."""
@@ -248,7 +264,8 @@ class ContactStep:
         )
 
     def numbers_changed(self) -> None:
-        """Upload changed friction or restitution."""
+        """Upload changed friction or restitution, which the next sub-step uses."""
+        self._forget_ahead()
         self.rebounds.numbers_changed()
         if not upload_pair_numbers(self.numbers, self.simulation.scene):
             arena = FieldArena()
@@ -261,43 +278,82 @@ class ContactStep:
         simulation, detection, searched = self.simulation, self.detection, self._searched
         if searched is None or searched[1] != dt or abs(searched[0] - time) > 1e-6 * dt:
             self._searched = None
-            self.far.forget()
             self._find(time, dt, prescribed=simulation.prescribed_moves(time + dt))
             self._searched = time, dt
         return detection.counts.contacts
 
+    def look_ahead(self, time: float, dt: float, n: int) -> None:
+        """Search for n sub-steps of dt from a time [s], see `search_ahead`."""
+        self._searched = None
+        self._find(time, n * dt)
+        self.ahead.begin(time, dt, n)
+        self._searched = self.ahead.searched
+        self.detection.paths.forget()  # the list of near triangles holds as long as the search
+
+    def _look_again(self) -> None:
+        """Repeat the search that serves several sub-steps, if a question has made another one since."""
+        if self._searched != self.ahead.searched:
+            is_near, self._searched = self._is_near, None
+            self.ahead.call_there(lambda: self._find(*self.ahead.searched))
+            self._searched, self._is_near = self.ahead.searched, is_near
+            self.detection.paths.forget()
+
+    def _forget_ahead(self) -> None:
+        """Discard the search that serves several sub-steps."""
+        self.far.forget()
+        if self.ahead is not None:
+            self.ahead.forget()
+
+    def keep(self, time: float, dt: float, n: int) -> int:
+        """Return how many of n sub-steps of dt from a time [s] are served by one search, after it was made."""
+        if self.ahead.n != MOST or not self.ahead.left(time, dt):
+            self.far.forget()
+            self.look_ahead(time, dt, MOST)
+        self._look_again()
+        self.detection.list_near()
+        return min(n, self.ahead.left(time, dt))
+
     def search_all(self, time: float, dt: float) -> None:
         """Do as `search`, among sleeping bodies, too; then the next step searches again."""
-        rests = self.detection.surface.rests.to_numpy() > 0
+        rests, is_near = self.detection.surface.rests.to_numpy() > 0, self._is_near
         if rests.any():
             self.let_rest(np.zeros_like(rests))
         self.search(time, dt)
+        self._is_near = is_near
         if rests.any():
             self.let_rest(rests)
 
     def is_far(self, time: float, dt: float) -> bool:
         """Return whether nothing can touch in an explicit step of dt from a time, see `far_apart`: it needs no search."""
-        now, counts, far = self.simulation.now, self.detection.counts, self.far
+        far = self.far
         if not far.covers(time + dt):
-            if not self._explicit or self.n_contacts or counts.active or counts.found or not now.none_cross or self.has_paths:
+            far.forget()
+            if self.ahead.left(time, dt) or self.n_contacts or self._is_near or not self.paths.none_cross or self.has_paths:
                 return False
             if not far.is_due():
                 return False
-            self._searched = None
-            far.search(time, dt)
+            far.search(time, dt, self._finds_nothing)
         if far.is_known:
+            self._look_again()
             self._measured_end, self._last_time, self._search_counts, self.had_impact = None, dt, (0, 0), False
         return far.is_known
+
+    def _finds_nothing(self, time: float, dt: float, n: int) -> bool:
+        """Return whether nothing can touch in n sub-steps of dt from a time [s], after a search for them."""
+        self.look_ahead(time, dt, n)
+        return not self._is_near
 
     def _find(self, time: float, dt: float, **along) -> None:
         """Call `Detection.find`; where nothing crosses, implicit steps drop what may never touch."""
         self.measures.begin(dt)
         self.detection.find(time, dt, held=self.simulation.now.held, none_cross=self.simulation.now.none_cross, **along)
+        self._is_near = self.detection.counts.active + self.detection.counts.found > 0
         if self.paths.none_cross and not self._explicit and self.detection.counts.contacts:
             self.measures.drop_uncertain()
 
     def begin(self, time: float, dt: float) -> int:
         """Fill the problem for a step of dt [s] from the state at a time, warm-started. Return its number of contacts."""
+        self._forget_ahead()
         n, self._measured_end, model = self.search(time, dt), None, self.simulation.model
         (surface, shapes, found, kept), counts = self.detection.found, self.detection.counts
         self.gap_targets = self._gap_targets()
@@ -322,8 +378,20 @@ class ContactStep:
 
     def begin_batch(self) -> None:
         """Prepare for sub-steps that the host does not follow, after a search: there must be room for its contacts."""
-        self.gap_targets, n = self._gap_targets(), self.detection.counts.contacts
-        self._make_room(n)
+        self.gap_targets, counts = self._gap_targets(), self.detection.counts
+        self.dropped = max(self.dropped, counts.unmapped)
+        self._make_room(counts.contacts)
+
+    def end_kept(self, dt: float, n: int | None, done: int, is_outdated: bool) -> None:
+        """Take over after so many sub-steps of dt [s] were done in a batch that keeps contacts.
+
+        n: contacts in the last of these, None if the next one has begun. is_outdated: whether that needs another search.
+        """
+        self._end_batch(dt)
+        self._n_contacts, self._search_counts = n, (self.detection.counts.found, self.detection.counts.unmapped)
+        self.ahead.done += done
+        if is_outdated or self.ahead.done == self.ahead.n:
+            self.ahead.forget()
 
     def end_batch(self, time: float, dt: float, n: int, found_before: int, found: int, kept: int, is_whole: bool) -> None:
         """Take over after sub-steps of dt [s] that the host has not followed; time: after those that were accepted.
@@ -333,10 +401,14 @@ class ContactStep:
         """
         self.detection.adopt(found, kept)
         self.measures.begin(dt)
-        self._searched, self._measured_end = (time, dt), None
+        self._searched, self._is_near = (time, dt), found > 0
         self._n_contacts, self._search_counts = (n, (found_before, 0)) if is_whole else (kept, (found, 0))
+        self._end_batch(dt)
+
+    def _end_batch(self, dt: float) -> None:
+        """See `end_batch`."""
         self._last_time, self._impulse_fraction, self.had_impact, self._indexed = dt, 1.0, False, True
-        self._renewal.sides, self._renewal.n_looks = None, 0
+        self._renewal.sides, self._renewal.n_looks, self._measured_end = None, 0, None
         self.measure_crossings()
 
     def renew(self, x_start: Any, displacement: Any) -> bool:
@@ -381,13 +453,12 @@ class ContactStep:
         self.had_impact = self.had_impact or found
         return found
 
-    def start_step(self, time: float, dt: float, may_be_far: bool = True) -> None:
-        """Begin a step of dt from a time. Penetration that exists there is not new. may_be_far: whether to ask `is_far`."""
+    def start_step(self, time: float, dt: float) -> None:
+        """Begin a step of dt from a time. Penetration that exists there is not new."""
         self.relative_penetration = 0.0
-        if not (may_be_far and self.is_far(time, dt)):
+        if not (self._explicit and self.crossing is not None and self.paths.none_cross):  # where it limits nothing
             self.search(time, dt)
-            if not (self._explicit and self.crossing is not None and self.paths.none_cross):  # where it limits nothing
-                self.relative_penetration = max(float(self.measures.closing[RELATIVE_PENETRATION]), self.initial_crossing())
+            self.relative_penetration = max(float(self.measures.closing[RELATIVE_PENETRATION]), self.initial_crossing())
         self._deepest, self._most_crossed = DEEP_PENETRATION, CROSSED
         self._raise_limits()
         self._substep_fraction, self._step_dt, self.dropped = 1.0, dt, 0
@@ -536,8 +607,11 @@ class ContactStep:
         """
         paths, self._is_fast = self.paths, False
         known = set() if paths.none_cross else self.found_features()
-        # explicit steps seldom leave what was searched, and are many
-        has_left, passes = (False, paths.find()) if self._explicit else paths.find_unless_left(start.x)
+        if not self._explicit:
+            has_left, passes = paths.find_unless_left(start.x)
+        else:  # they seldom leave what was searched, and are many; a search that serves several may have been before the start
+            has_left = self.ahead.n > 0
+            passes = not has_left and paths.find()
         if has_left or paths.uncovered:
             self.search_way(time, dt, start)
             passes = paths.find(as_searched=True)
@@ -587,6 +661,7 @@ class ContactStep:
         if ended is not None and ended[1] == dt and abs(ended[0] - time) <= 1e-6 * dt:
             return self._depth
         self._searched = None
+        self._forget_ahead()
         self.paths.use_active(self.problem)
         try:
             self.search(time, dt)
@@ -619,6 +694,7 @@ class ContactStep:
     def search_along(self, time: float, dt: float) -> None:
         """Search along `paths.displacement` from the present state, with all that was met."""
         self._searched = self._measured_end = None
+        self._forget_ahead()
         self.paths.use_all()
         self._find(time, dt, path=self.paths.displacement)
         self._searched = time, dt

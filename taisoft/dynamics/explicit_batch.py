@@ -1,10 +1,11 @@
 """Batches of explicit sub-steps with contacts, which the host only launches: it reads nothing before their end.
 
 Eight launches are a sub-step: fill the contact problem from the last search, predict, solve, move (Verlet: and kick again), check
-the paths, search at the end, and accept. What the host would have to decide is an event: it stops the batch, so that later
-launches do nothing, and the host takes over there, by the code of single sub-steps. No sub-step is accepted without the check of
-its paths. In scenes where only half-spaces, spheres and capsules at rest can be touched, by bodies without rigid parts, dependent
-or prescribed nodes and Maxwell branches, under loads that do not change. Others take single sub-steps.
+the paths, search at the end, and accept. Where triangles can touch each other, there is no search in a batch: it keeps the
+contacts of the one before it, see `search_ahead`. What the host would have to decide is an event: it stops the batch, so that
+later launches do nothing, and the host takes over there, by the code of single sub-steps. No sub-step is accepted without the
+check of its paths. In scenes where obstacles rest, with bodies without rigid parts, dependent or prescribed nodes and Maxwell
+branches, under loads that do not change. Others take single sub-steps.
 """
 
 import numpy as np
@@ -12,20 +13,24 @@ import taichi as ti
 
 from taisoft.backend.arrays import FieldArena
 from taisoft.backend.runtime import kernel
+from taisoft.collision.near_list import go_onward
 from taisoft.collision.reduction import FOUND, LEFT
-from taisoft.contact.build import NODES, fill, finish_contacts
+from taisoft.collision.surface import dvec
+from taisoft.contact.build import NODES, carry_on, fill, finish_contacts
 from taisoft.contact.problem import RESIDUAL, SWEEPS
 from taisoft.contact.solve import MOST_OF_TEAM, sweeps_per_launch, team_of
 from taisoft.dynamics.contact import ContactStep
 from taisoft.dynamics.explicit import reset_counters
 from taisoft.dynamics.explicit_contact import begin_solve, finish_verlet, move, predict
 from taisoft.dynamics.explicit_stepper import SubstepWork
+from taisoft.dynamics.search_ahead import SLACK
 from taisoft.dynamics.simulation_state import SimulationState
 from taisoft.dynamics.state import StepState
 from taisoft.fem.state import EVENT, GO
 
 MOST = 32  # sub-steps of a batch
-NOTHING, NOT_SOLVED, FAULT, NOT_FREE, NOT_FOUND = range(5)  # events, in the order in which a sub-step may meet them
+# events, in the order in which a sub-step may meet them; OUTDATED: it is accepted, but the next one needs another search
+NOTHING, NOT_SOLVED, FAULT, NOT_FREE, NOT_FOUND, OUTDATED = range(6)
 # Indices into the tally: sub-steps accepted, sweeps in them, largest residual, solves that did not converge, deepest penetration
 # [m], and over the finer side's edge; contacts in the last one; found by the search before the last one and by the last one, and
 # those kept
@@ -75,19 +80,39 @@ def accept(
     tally: ti.template(),
     dt: ti.f64,
     tolerance: ti.f64,
+    keeps: ti.template(),
+    searched_x: ti.template(),
+    slack: ti.f64,
 ):
-    """Accept a sub-step of dt [s]: end its contacts, copy the state to the good one, and add to the tally."""
+    """Accept a sub-step of dt [s]: end its contacts, copy the state to the good one, and add to the tally.
+
+    keeps: whether contacts are kept, up to a slack [m] of motion from the positions searched_x (n_nodes) [m].
+    """
     finish_contacts(p, m, good_x, slip, dt, s.run[GO])
+    if ti.static(keeps):
+        go_onward(s, m.state.x, s.run[GO])
     ti.loop_config(serialize=m.serial)
     for i in range(s.run[GO] * m.n_nodes):
         good_x[i], good_v[i], good_slip[i] = m.state.x[i], m.state.v[i], slip[i]
     ti.loop_config(serialize=p.team.alone, block_dim=p.team.threads)
     for t in range(p.team.threads):
-        depth, relative = ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64)
-        for j in range(p.team.share(t, reduction.count[LEFT])):
-            at = reduction.kept[p.team.term(t, j)]
-            depth = ti.max(depth, -found.gap[at])
-            relative = ti.max(relative, -found.gap[at] / ti.min(s.edge[found.body[at][0]], s.edge[found.body[at][1]]))
+        depth, relative, moved = ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64)
+        if ti.static(keeps):
+            lo, hi = dvec(ti.math.inf), dvec(-ti.math.inf)
+            for j in range(p.team.share(t, p.count[0])):
+                c = p.team.term(t, j)
+                depth = ti.max(depth, -p.gap[c])
+                relative = ti.max(relative, -p.gap[c] / ti.min(s.edge[p.body[c][0]], s.edge[p.body[c][1]]))
+                for e in range(p.first[c], p.first[c] + p.arity[c]):
+                    motion = m.state.x[p.node[e]] - searched_x[p.node[e]]
+                    lo, hi = ti.min(lo, motion), ti.max(hi, motion)
+            for k in ti.static(range(3)):
+                moved = ti.max(moved, p.team.largest(t, hi[k]) + p.team.largest(t, -lo[k]))
+        else:
+            for j in range(p.team.share(t, reduction.count[LEFT])):
+                at = reduction.kept[p.team.term(t, j)]
+                depth = ti.max(depth, -found.gap[at])
+                relative = ti.max(relative, -found.gap[at] / ti.min(s.edge[found.body[at][0]], s.edge[found.body[at][1]]))
         depth, relative = p.team.largest(t, depth), p.team.largest(t, relative)
         if t == 0 and s.run[GO] == 1:
             tally[DONE] += 1.0
@@ -100,6 +125,8 @@ def accept(
             tally[DEEPEST], tally[DEEPEST_RELATIVE] = ti.max(tally[DEEPEST], depth), ti.max(tally[DEEPEST_RELATIVE], relative)
             tally[FOUND_BEFORE], tally[FOUND_LAST] = tally[FOUND_LAST], reduction.count[FOUND]
             tally[KEPT_LAST] = reduction.count[LEFT]
+            if not moved <= slack:
+                s.run[GO], s.run[EVENT] = 0, OUTDATED
 
 
 class Batch:
@@ -112,16 +139,32 @@ class Batch:
         self.tally, self.event = np.zeros(N_TALLY), NOTHING
         m = simulation.model
         is_plain = not (m.viscous or m.has_rigid_tets or m.has_dependents or work.has_prescribed or simulation.ramp)
-        self._suits = is_plain and contact.detection.only_shapes
+        self._keeps = contact.detection.has_pairs
+        self._suits = is_plain and (contact.detection.only_shapes or self._keeps)
+        self._slack = SLACK * float(contact.detection.edges[: len(simulation.scene.bodies)].min())
 
     def suits(self) -> bool:
         """Return whether the next sub-steps may be a batch."""
         simulation, contact = self._simulation, self._contact
         is_free = simulation.now.none_cross and not len(simulation.now.held.pairs) and not contact.has_paths
-        return self._suits and is_free and not simulation.loads.vary and contact.detection.counts.contacts <= MOST_OF_TEAM
+        n = contact.n_contacts if self._keeps else contact.detection.counts.contacts
+        return self._suits and is_free and not simulation.loads.vary and n <= MOST_OF_TEAM
+
+    @property
+    def asks_for_far(self) -> bool:
+        """Whether sub-steps in which nothing can touch are taken without a search: on the GPU path a batch with searches reads
+        less."""
+        return self._simulation.model.on_cpu or self._keeps or not self.suits()
+
+    def search(self, n: int, time: float, dt: float) -> int:
+        """Search, unless it is known what is near, and return how many of n sub-steps of dt [s] from a time a batch can take."""
+        if self._keeps:
+            return self._contact.keep(time, dt, n)
+        self._contact.search(time, dt)
+        return n
 
     def run(self, n: int, time: float, dt: float, good: StepState, max_sweeps: int) -> None:
-        """Take up to n sub-steps of dt [s], after a search at their time.
+        """Take up to n sub-steps of dt [s], after `search`.
 
         good: the state at the start, which becomes that after the last sub-step accepted. The tally is right after Ctrl-C, too.
         """
@@ -134,9 +177,13 @@ class Batch:
                 self.launch(k, time + k * dt, dt, good, max_sweeps)
         finally:
             interrupt = self._read(n)
-            contact.far.skip(int(self.tally[DONE]) - int(self.event == NOTHING))
-            counts = (int(self.tally[k]) for k in (CONTACTS, FOUND_BEFORE, FOUND_LAST, KEPT_LAST))
-            contact.end_batch(time + self.tally[DONE] * dt, dt, *counts, self.event == NOTHING)
+            done, counts = int(self.tally[DONE]), [int(self.tally[k]) for k in (CONTACTS, FOUND_BEFORE, FOUND_LAST, KEPT_LAST)]
+            contact.far.skip(done - int(self.event == NOTHING and not self._keeps))
+            if self._keeps:
+                is_whole = self.event in (NOTHING, OUTDATED)
+                contact.end_kept(dt, counts[0] if is_whole else None, done, self.event == OUTDATED)
+            else:
+                contact.end_batch(time + done * dt, dt, *counts, self.event == NOTHING)
         if interrupt is not None:
             raise interrupt
 
@@ -146,7 +193,7 @@ class Batch:
         while True:
             try:
                 tally = self._tally.to_numpy()
-                event = NOTHING if tally[DONE] == n else int(self._contact.detection.surface.run[EVENT])
+                event = NOTHING if tally[DONE] == n and not self._keeps else int(self._contact.detection.surface.run[EVENT])
                 self.tally, self.event = tally, event
                 return interrupt
             except KeyboardInterrupt as error:
@@ -157,7 +204,10 @@ class Batch:
         model, contact, work, detection = self._simulation.model, self._contact, self._work, self._contact.detection
         p, s, search = contact.problem, detection.surface, (detection.surface, detection.shapes)
         warm, offset, n = contact.warm_factor(dt) if k == 0 else 1.0, contact.contact_offset, detection.counts.contacts
-        fill(p, model, *search, contact.numbers, detection.buffer.data, detection.reduction, -1, dt, warm, offset, 1)
+        if self._keeps and contact.ahead.done + k > 0:
+            carry_on(p, model, s, dt, offset)
+        else:
+            fill(p, model, *search, contact.numbers, detection.buffer.data, detection.reduction, -1, dt, warm, offset, 1)
         predict(model, work, p, s, dt, *contact.gap_targets)
         solve = self._method, self._tolerance, min(max_sweeps, sweeps_per_launch(n)), max_sweeps
         begin_solve(p, team_of(p, self._method, n)[0], s, *solve, NOT_SOLVED)
@@ -165,10 +215,11 @@ class Batch:
         if work.verlet:
             finish_verlet(model, work, p, s, dt, FAULT)
         detection.paths.check_in_batch(model.state.x, NOT_FREE)
-        room = min(p.capacity - 1, p.node.shape[0] // (NODES * model.most_masters))
-        detection.search_shapes(detection.motion(time + dt, dt), True, room, NOT_FOUND)
-        state = good.x, good.v, good.slip, self._simulation.now.slip
-        accept(model, p, s, detection.buffer.data, detection.reduction, *state, self._tally, dt, self._tolerance)
+        if not self._keeps:
+            room = min(p.capacity - 1, p.node.shape[0] // (NODES * model.most_masters))
+            detection.search_shapes(detection.motion(time + dt, dt), True, room, NOT_FOUND)
+        state, kept = (good.x, good.v, good.slip, self._simulation.now.slip), (self._keeps, contact.ahead.x, self._slack)
+        accept(model, p, s, detection.buffer.data, detection.reduction, *state, self._tally, dt, self._tolerance, *kept)
 
     @property
     def field_bytes(self) -> dict[str, int]:

@@ -18,6 +18,7 @@ from taisoft.dynamics.explicit_batch import (
     NOT_FOUND,
     NOT_SOLVED,
     NOTHING,
+    OUTDATED,
     UNSOLVED,
     WORST,
     Batch,
@@ -81,16 +82,16 @@ class ContactExplicitStepper(ExplicitStepper):
             targets = simulation.next_targets(start + dt * np.arange(1, n + 1))
             self.acceleration_stale = self.acceleration_stale or simulation.releases != releases
             n = len(targets)
-        self.contact.start_step(start, dt, self._may_be_far())
+        self.contact.start_step(start, dt)
         try:
             while done < n:
                 if targets is not None:
                     self._upload_targets(targets[done : done + 1])
-                event, is_far = NOTHING, self._may_be_far() and self.contact.is_far(start + done * dt, dt)
+                event, is_far = NOTHING, self.batch.asks_for_far and self.contact.is_far(start + done * dt, dt)
                 if not is_far and self.batch.suits():
                     event = self._take_batch(min(n - done, MOST), start + done * dt, dt, tally)
                     done = int(tally[DONE])
-                    if event == NOTHING:
+                    if event in (NOTHING, OUTDATED):
                         continue
                 result = self._substep(simulation.step_count + done + 1, start + done * dt, dt, is_far, event)
                 if result:
@@ -133,7 +134,7 @@ class ContactExplicitStepper(ExplicitStepper):
         batch = self.batch
         batch.tally[:] = 0.0
         self._prepare(time)
-        self.contact.search(time, dt)
+        n = batch.search(n, time, dt)
         try:
             batch.run(n, time, dt, self.good, MAX_SWEEPS)
         finally:  # Ctrl-C, too
@@ -143,10 +144,6 @@ class ContactExplicitStepper(ExplicitStepper):
             tally[WORST] = max(tally[WORST], batch.tally[WORST])
             self._deepen(tally, *batch.tally[[DEEPEST, DEEPEST_RELATIVE]])
         return batch.event
-
-    def _may_be_far(self) -> bool:
-        """Return whether sub-steps in which nothing can touch are taken without a search: on the GPU path a batch reads less."""
-        return self.simulation.model.on_cpu or not self.batch.suits()
 
     def _deepen(self, tally: np.ndarray, depth: float, relative: float) -> None:
         """Add penetrations to the tally."""

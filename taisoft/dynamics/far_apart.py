@@ -6,6 +6,8 @@ half the reach. MAX_DEVIATION leaves as much again: what a search in a single su
 results are the same as with a search in each. Weak: bodies whose boxes meet, and those tested against themselves, gain nothing.
 """
 
+from collections.abc import Callable
+
 import taichi as ti
 
 from taisoft.backend.runtime import kernel
@@ -63,16 +65,23 @@ class FarApart:
         """Count n sub-steps that have not asked."""
         self._pause = max(self._pause - n, 0)
 
-    def search(self, time: float, dt: float) -> None:
-        """Search from a time [s] for as many sub-steps of dt as nothing can touch in, instead of the detection's last search."""
-        self.forget()
+    def search(self, time: float, dt: float, finds_nothing: Callable[[float, float, int], bool]) -> None:
+        """Search from a time [s] for as many sub-steps of dt as nothing can touch in. finds_nothing: searches for so many."""
         while self._length >= FEWEST:
-            self._detection.find(time, self._length * dt, none_cross=True)
-            if self._detection.counts.active == 0 and self._detection.counts.found == 0:
+            if finds_nothing(time, dt, self._length):
                 self._until, self._length = time + (self._length + 0.5) * dt, MOST
                 return
             self._length //= 4
         self._length, self._pause = MOST, PAUSE
+
+    def snapshot(self) -> dict:
+        """Return what is known for a checkpoint."""
+        return {"until": self._until, "length": self._length, "pause": self._pause}
+
+    def restore(self, kept: dict) -> None:
+        """Restore a `snapshot`; an empty one, that of a start."""
+        self._until = float(kept.get("until", 0.0))
+        self._length, self._pause = int(kept.get("length", MOST)), int(kept.get("pause", 0))
 
     def stays(self) -> bool:
         """Return whether all vertices are near their paths at the end of a sub-step; if not, nothing is known any more."""
