@@ -39,7 +39,7 @@ class ContactStageWork:
     past_change: Any  # (PAST capacity) 3-vectors f64: those minus the multipliers that gave them [N s]
     tangential_offset: Any  # (capacity) 3-vectors f64: J (x_start - x_hat) minus obstacle displacement [m]
     gap_minus_target: Any  # (capacity) f64: gap - target at the start, minus obstacle displacement along the normal [m]
-    velocity: Any  # (capacity) 3-vectors f64: u at the start of a step [m/s]
+    velocity: Any  # (capacity) 3-vectors f64: u at the present x [m/s]
     rate: Any  # (capacity) 3-vectors f64: derivative of u along the step [m/s]
     kept: Any  # (capacity) 3-vectors f64: impulses at linearisation [N s]
     world_impulse: Any  # (capacity) 3-vectors f64: impulse in world axes [N s]
@@ -167,29 +167,54 @@ def unprojected_impulse(contacts: ti.template(), c, u, r_scale):
 
 
 @ti.func
+def is_open(contacts: ti.template(), c, z):
+    """Whether prox(z) is 0 with the friction disk fixed, and so is its derivative, without a look at tangents."""
+    return z[0] <= 0.0 and contacts.work.radius[c] == 0.0
+
+
+@ti.func
 def projected_impulse(contacts: ti.template(), c, z):
     """Return p = prox(z) with the friction disk fixed; 0 if no node of the contact can move."""
-    p = into_disk(dvec(ti.max(z[0], 0.0), z[1], z[2]), contacts.work.radius[c])
-    if contacts.problem.factor[c][0] == 0.0:
-        p = dvec(0.0)
+    p = dvec(0.0)
+    if not (is_open(contacts, c, z) or contacts.problem.factor[c][0] == 0.0):
+        p = into_disk(dvec(ti.max(z[0], 0.0), z[1], z[2]), contacts.work.radius[c])
     return p
 
 
 @ti.func
 def update_contact(m: ti.template(), contacts: ti.template(), c, beta, r_scale):
-    """Compute the impulse p.r of contact c at the present x, its matrix block, and its part of the laws' residual."""
+    """Compute u and the impulse p.r of contact c at the present x, its matrix block, and its part of the laws' residual."""
     rows, work = ti.static((contacts.problem, contacts.work))
     u = stage_velocity_of(contacts, c, beta)
-    Rn, Rt = r_scale * rows.factor[c][0], r_scale * rows.factor[c][1]
-    z, rho = unprojected_impulse(contacts, c, u, r_scale), work.radius[c]
-    size = ti.sqrt(z[1] * z[1] + z[2] * z[2])
-    r = projected_impulse(contacts, c, z)
+    work.velocity[c] = u
+    z = unprojected_impulse(contacts, c, u, r_scale)
+    r, step, opens = projected_impulse(contacts, c, z), scaled(rows.factor[c], u), is_open(contacts, c, z)
     rows.r[c] = r
-    step = scaled(rows.factor[c], u)
-    state = state_of(dvec(r[0], r[1] - step[1], r[2] - step[2]), rho)
+    state = state_of(dvec(r[0], r[1] - step[1], r[2] - step[2]), work.radius[c])
     if state != OPEN or rows.impact_impulse[c].norm() == 0.0:  # what pressed in an impact alone keeps its state there
         rows.status[c] = state
-    # D in the contact frame, then in world axes
+    world_impulse, d = dvec(0.0), dvec(0.0)
+    if not opens:
+        n, t1 = rows.normal[c], rows.tangent[c]
+        world_impulse = r[0] * n + r[1] * t1 + r[2] * n.cross(t1)
+        _set_block(m, contacts, c, z, r_scale)
+    elif work.active[c] == 1:
+        work.block[c], work.active[c] = ti.Vector.zero(m.real, BLOCK), 0
+    if not (opens and u[0] >= 0.0):
+        d = r - prox(r - step, rows.friction[c])
+    work.world_impulse[c] = world_impulse
+    # only a node that can move can open a gap
+    missed = ti.select(rows.factor[c][0] > 0.0, -u[0] * beta * work.gap_weight[c], 0.0)
+    within_rounding = rows.factor[c][0] * work.rounding[c]  # an impulse that only this would change, as between bodies at rest
+    work.prox_residual[c] = dvec(d.dot(d), r.dot(r) + within_rounding * within_rounding, missed)
+
+
+@ti.func
+def _set_block(m: ti.template(), contacts: ti.template(), c, z, r_scale):
+    """Set the matrix block D of contact c in world axes."""
+    rows, work = ti.static((contacts.problem, contacts.work))
+    Rn, Rt, rho = r_scale * rows.factor[c][0], r_scale * rows.factor[c][1], work.radius[c]
+    size = ti.sqrt(z[1] * z[1] + z[2] * z[2])
     Dn = ti.select(z[0] > 0.0, Rn, 0.0)
     D_along, D_across = Rt, Rt  # along z_t, and perpendicular to it
     if size > rho or rho == 0.0:  # slips; without a disk there is no resistance, even at rest
@@ -197,21 +222,14 @@ def update_contact(m: ti.template(), contacts: ti.template(), c, beta, r_scale):
         if size > 0.0:
             D_across = Rt * rho / size
     n, t1 = rows.normal[c], rows.tangent[c]
-    t2 = n.cross(t1)
-    work.world_impulse[c] = r[0] * n + r[1] * t1 + r[2] * t2
     e = t1
     if size > 0.0:
-        e = (z[1] * t1 + z[2] * t2) / size
+        e = (z[1] * t1 + z[2] * n.cross(t1)) / size
     g = n.cross(e)
     for i in ti.static(range(3)):
         for j in ti.static(range(3)):
             work.block[c][4 * j + i] = ti.cast(Dn * n[i] * n[j] + D_along * e[i] * e[j] + D_across * g[i] * g[j], m.real)
     work.active[c] = int(Dn > 0.0 or D_along > 0.0 or D_across > 0.0)
-    d = r - prox(r - step, rows.friction[c])
-    # only a node that can move can open a gap
-    missed = ti.select(rows.factor[c][0] > 0.0, -u[0] * beta * work.gap_weight[c], 0.0)
-    within_rounding = rows.factor[c][0] * work.rounding[c]  # an impulse that only this would change, as between bodies at rest
-    work.prox_residual[c] = dvec(d.dot(d), r.dot(r) + within_rounding * within_rounding, missed)
 
 
 @ti.func

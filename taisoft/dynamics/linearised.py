@@ -15,7 +15,6 @@ from taisoft.dynamics.contact_terms import (
     impulse_on_node,
     projected_impulse,
     set_multiplier,
-    stage_velocity_of,
     unprojected_impulse,
     update_contact,
 )
@@ -133,10 +132,9 @@ def _node_slope(m: ti.template(), stage: ti.template(), A: ti.template(), contac
 
 
 @ti.func
-def _contact_slope(stage: ti.template(), contacts: ti.template(), c, beta):
-    """Compute u of contact c and its rate along y."""
+def _contact_rate(stage: ti.template(), contacts: ti.template(), c):
+    """Compute the rate of u of contact c along y."""
     rows, work = ti.static((contacts.problem, contacts.work))
-    work.velocity[c] = stage_velocity_of(contacts, c, beta)
     d, n, t = dvec(0.0), rows.normal[c], rows.tangent[c]
     for e in range(rows.first[c], rows.first[c] + rows.arity[c]):
         d += rows.weight[e] * ti.cast(stage.pcg.y[rows.node[e]], ti.f64)
@@ -201,7 +199,7 @@ def find_step_length(
     fold(m, SUM, OTHER_SUM, ())
     ti.loop_config(serialize=rows.serial)
     for c in range(rows.count[0]):
-        _contact_slope(stage, contacts, c, beta)
+        _contact_rate(stage, contacts, c)
     ti.loop_config(serialize=rows.team.alone, block_dim=rows.team.threads)
     for t in range(rows.team.threads):
         _find_step_length(m, stage, contacts, r_scale, t)
