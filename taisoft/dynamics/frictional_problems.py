@@ -12,7 +12,7 @@ class FrictionalProblems:
     SOLVES, FORCING, LATER_FORCING = 60, 0.3, 0.01
     # fractions of the stage's |r| and laws' residual to which a problem is solved, or these fractions of the tolerances, which
     # survive a full nonlinear step
-    REDUCTION, LAW_REDUCTION, TOLERANCE_FRACTION, LAW_TOLERANCE_FRACTION = 0.1, 0.1, 0.3, 0.8
+    REDUCTION, LAW_REDUCTION, TOLERANCE_FRACTION, LAW_TOLERANCE_FRACTION = 0.1, 0.1, 0.6, 0.8
     LAW_BALANCE = 0.03  # laws' residual over the required relative |r|; the next matrix would undo more accuracy
     MULTIPLIER_FRACTION = 0.3  # of the required |r|, ends the steps under one multiplier: updates at a large |r| overshoot
     NEAR_FLOOR = 6.0  # times the floor of |r|: below it, |r| may be mostly rigid motion

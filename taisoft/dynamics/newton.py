@@ -26,7 +26,7 @@ from dataclasses import replace
 from functools import partial
 
 from taisoft.dynamics.constraints import correct, solve_constrained
-from taisoft.dynamics.contact_terms import KEEP, OF_IMPULSES, TO_IMPULSES
+from taisoft.dynamics.contact_terms import KEEP, TO_IMPULSES
 from taisoft.dynamics.friction import Friction, Goal, Solution
 from taisoft.dynamics.frictional_problems import FrictionalProblems
 from taisoft.dynamics.results import StageResult, relative
@@ -47,9 +47,9 @@ class Newton:
     # linear solves without contacts: CG's maximum tolerance, after a step that increased |r|, and in statics, where a loose solve
     # leaves a slender body stretched for the next step to correct
     MAX_FORCING, INCREASE_FORCING, STATIC_FORCING = 0.1, 3e-2, 1e-2
-    # a step that leaves a larger fraction of |r| requires a new matrix; with curved steps, whose first matrix is that of the
-    # step's start and whose solves are longer
-    REBUILD_RATIO, REBUILD_VOLUMES = 0.2, 0.01
+    # fraction of |r| above which what a step leaves requires a new matrix: without contacts, with contacts, and with curved
+    # steps, whose first matrix is that of the step's start and whose solves are longer
+    REBUILD_RATIO, REBUILD_ROWS, REBUILD_VOLUMES = 0.2, 0.1, 0.01
     NEAR = 100.0  # times the tolerance: |r| that a direct solve leaves below which its factor serves once more
     LINEAR_LIMIT = 0.01  # relative true residual above which a linearised stage without contacts has failed
     LINEARISED_SOLVES, LINEARISED_FORCING = 400, 0.1  # maximum linear solves of one with contacts, and their tolerance
@@ -62,7 +62,7 @@ class Newton:
         self.max_forcing = self.MAX_FORCING if stage.c > 0.0 else self.STATIC_FORCING
         self.newton = self.linear = self.multigrid = self.updates = self.n_corrections = 0
         self.most, self.is_projected = stage.max_newton, False  # the latter of the last iteration
-        self.keeps = False  # the factor for another problem
+        self.n_uses, self.keeps = 0, False  # iterations with the present matrix; whether its factor serves another problem
         self.solved = self.solved_before = (
             math.inf
         )  # |r| that the last direct solve left, with the contacts' geometry that it had
@@ -77,10 +77,10 @@ class Newton:
         while True:
             if self.has_rows and self.newton and stage.renews and system.renew_contacts():
                 self._evaluate_again()
-                fresh = False
             if self._has_converged():
                 if is_accepted := self._passes_checks():
                     break
+                fresh = fresh and not self.has_rows
             if not self._may_go_on():
                 break
             if not (fresh or self._keeps_factor()) or self._needs_matrix():
@@ -92,7 +92,7 @@ class Newton:
             self._find_rounding()
             if not moved and self.n_uses == 1 and not (self.keeps or self._has_converged()):
                 break
-            fresh = moved and not self.has_rows
+            fresh = moved and (not self.has_rows or self._keeps_matrix())
             decrease = self.PROJECTED if self.is_projected else self.DECREASE
             is_slow = not (self._is_balanced or self.r < decrease * self.lowest)
             self.n_slow = self.n_slow + 1 + self.is_projected if is_slow else 0
@@ -122,7 +122,7 @@ class Newton:
 
     def _restart(self) -> None:
         """Reset the progress, for a new or changed problem."""
-        self.lowest, self.previous, self.forcing, self.n_slow, self.n_uses = self.r, 0.0, self.max_forcing, 0, 0
+        self.lowest, self.previous, self.forcing, self.n_slow = self.r, 0.0, self.max_forcing, 0
         self.rounding = False  # |r| is only rounding
 
     def _evaluate_again(self, mode: int | None = None) -> None:
@@ -215,7 +215,11 @@ class Newton:
     def _needs_matrix(self) -> bool:
         """Whether a matrix that is formed is used up."""
         ratio = self.REBUILD_VOLUMES if self.system.keeps_volumes else self.REBUILD_RATIO
-        return not self.has_rows and self.n_uses >= 1 and self.r > ratio * self.previous
+        return not self.has_rows and self.r > ratio * self.previous > 0.0
+
+    def _keeps_matrix(self) -> bool:
+        """Whether the next frictional problem takes the matrix of the last one, if that was solved by iterations."""
+        return self.solved == math.inf and not self.is_projected and self.r <= self.REBUILD_ROWS * self.previous
 
     def _keeps_factor(self) -> bool:
         """Whether the next frictional problem takes the factor of the last one, which led near enough."""
@@ -280,8 +284,7 @@ class Newton:
         if found.negative:
             self.r, self.scale = system.end_linearised(accept=False)
             return False
-        # the laws hold less well than forces are balanced; keeping the impulses separates the two
-        self.r, self.scale = system.end_linearised(new_multipliers=OF_IMPULSES if found.direct else TO_IMPULSES)
+        self.r, self.scale = system.end_linearised(solved=found.converged or found.direct)
         self.solved_before, self.solved = self.solved, self.r if found.direct else math.inf
         if self.r < accept:
             return True

@@ -513,20 +513,21 @@ class StageSystem:
         """Whether there are rigid bodies alone, whose problems are solved directly at once."""
         return self._direct is not None and self._direct.is_rigid
 
-    def end_linearised(self, accept: bool = True, new_multipliers: int = TO_IMPULSES) -> tuple[float, float]:
+    def end_linearised(self, accept: bool = True, solved: bool = True) -> tuple[float, float]:
         """Restore nonlinear elastic forces; return (|r|, scale). y is then the velocity change since linearisation, base its x.
 
-        accept: keep the new state, with multipliers from its impulses; otherwise restore state and multipliers of that time.
+        accept: keep the new state; otherwise restore that of that time. solved: keep its impulses, so that |r| does not contain
+        what the laws miss; otherwise the multipliers are updated once more.
         """
         end_linearised(self.model, self.work, self.contacts, int(accept), self.stage.beta)
         self.kind = self._nonlinear_kind
-        return self.evaluate(AGAIN, float(accept), new_multipliers)
+        return self.evaluate(AGAIN, float(accept), OF_IMPULSES if solved else TO_IMPULSES)
 
     def end_once(self, direct: bool) -> None:
         """End a stage that was linearised once. direct: whether its frictional problem was solved directly."""
         self.balance_rigid_motion()
         if direct:
-            self.end_linearised(new_multipliers=OF_IMPULSES)
+            self.end_linearised()
         elif self.model.has_dependents:  # linearised steps move only the nodes that they depend on
             place_dependents(self.model)
 
