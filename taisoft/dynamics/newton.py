@@ -63,9 +63,7 @@ class Newton:
         self.newton = self.linear = self.multigrid = self.updates = self.n_corrections = 0
         self.most, self.is_projected = stage.max_newton, False  # the latter of the last iteration
         self.n_uses, self.keeps = 0, False  # iterations with the present matrix; whether its factor serves another problem
-        self.solved = self.solved_before = (
-            math.inf
-        )  # |r| that the last direct solve left, with the contacts' geometry that it had
+        self.solved = self.solved_before = math.inf  # |r| that the last two direct solves left, with the geometry that they had
         self.problems = FrictionalProblems(system, stage)
 
     def run(self, fresh: bool) -> StageResult:
