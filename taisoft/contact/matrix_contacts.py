@@ -41,9 +41,8 @@ class MatrixContacts:
         """Return impulses (k,3), from the start r (k,3), and the result; by sweeps, Newton's method if W is an array, or else by
         an augmented Lagrangian.
 
-        W: (3k,3k); b: (3k,); friction: (k,); method, tolerance,
-        sweeps: as in `contact.solve.solve`; outer: maximum iterations of the augmented Lagrangian. factor, limit: other r-factors
-        (k,2), and a bound on the residual with these.
+        W: (3k,3k); b: (3k,); friction: (k,); method, tolerance, sweeps: as in `contact.solve.solve`; outer: maximum iterations of
+        the augmented Lagrangian. factor, limit: other r-factors (k,2), and a bound on the residual with these.
         """
         is_dense, own, iterations = isinstance(W, np.ndarray), augmented_lagrangian.find_factors(W), 0
 

@@ -3,11 +3,11 @@ of small stages whose iterations take longer, as where bodies are stiff or thin,
 
 The change s of v satisfies A s = J^T r - r_0, r_0 the residual without contacts. With s eliminated, the impulses r solve
     u = W r + b,   W = J A^-1 J^T,   b = u_0 - J A^-1 r_0
-with the laws of contact, u_0 the contacts' velocities at the start: by Gauss-Seidel sweeps on W, then, if they do not suffice, by
-Newton's method or an augmented Lagrangian on the host. With A = L L^T (`multifrontal`), W is Y^T Y with Y = L^-1 J^T. The laws'
-residual is measured with the stage's r-factors, too, as that of iterations.
-A couples no nodes of different parts, bodies in general, so that W is found part by part.
-Weakness: W is dense within each part: only stages with few contacts a body are solved so.
+with the laws of contact, u_0 the contacts' velocities at the start: by Newton's method on a dense W, by Gauss-Seidel sweeps on a
+sparse one, and by an augmented Lagrangian where these do not suffice. With A = L L^T (`multifrontal`), W is Y^T Y with
+Y = L^-1 J^T (`delassus`). The laws' residual is measured with the stage's r-factors, too, as that of iterations. A problem whose
+matrix was not formed anew takes L again, and with the same contacts also Y and W.
+Weakness: W is dense within each part of A: only stages with few contacts a body are solved so.
 """
 
 import math
@@ -31,11 +31,10 @@ from taisoft.scene.rigid import FRAME
 class DirectSolver:
     """Direct solves of the linearised stages of one system, whose unknowns are the nodes that depend on no others."""
 
-    # most rows of W, Gauss-Seidel sweeps, and iterations of the augmented Lagrangian after these: of rigid bodies alone, and of
-    # others, whose W takes longer
-    RIGID, SOFT = (2000, 1000, OUTER), (900, 200, 5)
-    # of the laws' tolerance: sweeps end at FRACTION, with the r-factors of W; where those of the stage, which stiff bodies make
-    # far larger, leave more than MET, Newton's method goes on
+    # most rows of W, and iterations of the augmented Lagrangian: of rigid bodies alone, and of others, whose W takes longer
+    RIGID, SOFT = (2000, OUTER), (900, 5)
+    DENSE_ROWS, SWEEPS = 900, 1000  # most rows of a dense W; Gauss-Seidel sweeps on a sparse one
+    # of the laws' tolerance: to be reached with the r-factors of W, and with those of the stage, which stiff bodies make far larger
     FRACTION, MET = 0.1, 0.5
     ROUNDS = 4  # solves of a problem, each with the contacts that the last one would close
     # [s], measured on one core: what a solve takes beside factorisation and W, a number of L times a row of W, and a row of W
@@ -50,7 +49,7 @@ class DirectSolver:
         self._model, self._A, self._x_hat, self._contacts = model, matrix, x_hat, MatrixContacts(model.on_cpu)
         # then all stages are solved so at once, unless it is expected to take too long
         self.is_rigid = m.has_rigid_tets and FRAME * m.rigid_tets.n + m.dependents.n == m.n_nodes
-        self._max_rows, *self._limits = self.RIGID if self.is_rigid else self.SOFT
+        self._max_rows, self._outer = self.RIGID if self.is_rigid else self.SOFT
         self._nodes = np.flatnonzero(m.dependents.number.to_numpy() < 0) if m.has_dependents else np.arange(m.n_nodes)
         self._factor: Factor | None = None
         self._delassus: Delassus | None = None
@@ -152,8 +151,8 @@ class DirectSolver:
                 b = start[own].reshape(-1)
                 for part in delassus.parts:
                     b[part.rows] += part.Y.T @ without[part.unknowns]
-                limits = self.FRACTION * tolerance, *self._limits, factor[own], self.MET * tolerance
-                given_W = delassus.matrix(self.SOFT[0]), b, friction[own]
+                limits = self.FRACTION * tolerance, self.SWEEPS, self._outer, factor[own], self.MET * tolerance
+                given_W = delassus.matrix(self.DENSE_ROWS), b, friction[own]
                 impulses[own], result = self._contacts.solve(*given_W, r[own], "gauss_seidel", *limits)
                 iterations += result.iterations
                 for part in delassus.parts:
