@@ -34,7 +34,7 @@ class DirectSolver:
     # most rows of W, and iterations of the augmented Lagrangian: of rigid bodies alone, and of others, whose W takes longer
     RIGID, SOFT = (2000, OUTER), (900, 5)
     DENSE_ROWS, SWEEPS = 900, 1000  # most rows of a dense W; Gauss-Seidel sweeps on a sparse one
-    # of the laws' tolerance: to be reached with the r-factors of W, and with those of the stage, which stiff bodies make far larger
+    # of the aim: to be reached with the r-factors of W, and with those of the stage, which stiff bodies make far larger
     FRACTION, MET = 0.1, 0.5
     ROUNDS = 4  # solves of a problem, each with the contacts that the last one would close
     # [s], measured on one core: what a solve takes beside factorisation and W, a number of L times a row of W, and a row of W
@@ -129,13 +129,13 @@ class DirectSolver:
         self._factor.fronts.factorise(values)
 
     def solve(
-        self, stage_contacts: StageContacts, beta: float, tolerance: float, acceptable: float, with_residual: bool
+        self, stage_contacts: StageContacts, beta: float, tolerance: float, acceptable: float, with_residual: bool, aim: float
     ) -> tuple[int, bool, float] | None:
         """Move a linearised stage, whose matrix is prepared, to its solution; return (iterations, converged, |r|).
 
         W is that of contacts that press or close, with those that the solution would close, until there are none. tolerance: of
         the laws' residual. acceptable: that residual above which a result is rejected, the state kept, and None returned.
-        with_residual: whether to measure |r|, which is rounding; else it is 0.
+        with_residual: whether to measure |r|, which is rounding; else it is 0. aim: at what residual of the laws W is solved.
         """
         m, k, w, delassus = self._model, stage_contacts, self._delassus.unknowns, self._delassus
         p, n = k.problem, int(k.problem.count[0])
@@ -151,7 +151,7 @@ class DirectSolver:
                 b = start[own].reshape(-1)
                 for part in delassus.parts:
                     b[part.rows] += part.Y.T @ without[part.unknowns]
-                limits = self.FRACTION * tolerance, self.SWEEPS, self._outer, factor[own], self.MET * tolerance
+                limits = self.FRACTION * aim, self.SWEEPS, self._outer, factor[own], self.MET * aim
                 given_W = delassus.matrix(self.DENSE_ROWS), b, friction[own]
                 impulses[own], result = self._contacts.solve(*given_W, r[own], "gauss_seidel", *limits)
                 iterations += result.iterations

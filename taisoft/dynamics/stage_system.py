@@ -501,10 +501,10 @@ class StageSystem:
         if direct is None or self._rejects_direct:
             return None
         found, most = None, max(tolerance, self.contact_residual)
-        tolerance = min(tolerance, self.stage.contact_tolerance)  # which costs little more than a loose one, and saves a solve
+        aim = min(tolerance, self.stage.contact_tolerance)  # which costs little more than a loose one, and saves a solve
         with one_thread():
             if is_prepared := direct.prepare(self.contacts):
-                found = direct.solve(self.contacts, self.stage.beta, tolerance, most, self.stage.linearised)
+                found = direct.solve(self.contacts, self.stage.beta, tolerance, most, self.stage.linearised, aim)
         self._rejects_direct = found is None and (after or not is_prepared)
         return found
 
