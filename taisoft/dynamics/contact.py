@@ -424,8 +424,10 @@ class ContactStep:
         entries = most_entries(self.simulation.model, needed - self.n_contacts, self.detection.end.buffer.n_listed)
         if room := self._room(needed, renewal.n_entries + entries):
             last_time, rows, mass = self._last_time, read_rows(self.problem, MORE_ROWS), self.problem.inverse_mass.to_numpy()
+            factor = self.problem.factor.to_numpy(self.n_contacts)
             self._allocate(*room)
             upload([(self.problem.inverse_mass, mass)])
+            self.problem.factor.from_numpy(factor, 0)
             write_rows(self.problem, rows)
             index_nodes(self.problem)
             self._last_time, self._indexed = last_time, True

@@ -328,14 +328,19 @@ class StageSystem:
         before, grows = self.contacts, self.step_contacts.problem is not self.contacts.problem
         if not (changed or grows):
             return False
-        base = before.coupling.base.to_numpy() if grows else None
+        base, *laws = download([before.coupling.base, before.work.multiplier, before.work.radius]) if grows else (None,)
         self.begin_contacts()
-        if grows:  # set the displacements in the new storage, and the diagonal
+        if grows:  # set the displacements in the new storage, the diagonal, and the multipliers
             upload([(self.contacts.coupling.base, base)])
+            for array, values in zip((self.contacts.work.multiplier, self.contacts.work.radius), laws):
+                array.from_numpy(values, 0)
             move(self.model, self.work, self.contacts, self.kind, STAY, 1.0, self.stage.c, self.stage.beta)
         self._same_matrix = False  # its rows are, but not those of the contacts' terms
-        self.find_factors()
-        return True
+        if changed:
+            self.find_factors()
+        else:  # room alone must not change results
+            self.evaluate(None)
+        return changed
 
     def evaluate(self, mode: int | None = STAY, step_length: float = 1.0, new_multipliers: int = KEEP) -> tuple[float, float]:
         """Return (|r|, scale) after `move` in a mode; None: x and the elastic forces are unchanged.
