@@ -44,7 +44,7 @@ class MatrixContacts:
         W: (3k,3k); b: (3k,); friction: (k,); method, tolerance, sweeps: as in `contact.solve.solve`; outer: maximum iterations of
         the augmented Lagrangian. factor, limit: other r-factors (k,2), and a bound on the residual with these.
         """
-        is_dense, own, iterations = isinstance(W, np.ndarray), augmented_lagrangian.find_factors(W), 0
+        own, iterations = augmented_lagrangian.find_factors(W), 0
 
         def residuals(r: np.ndarray) -> tuple[float, float]:
             u = (W @ r.reshape(-1) + b).reshape(-1, 3)
@@ -54,28 +54,36 @@ class MatrixContacts:
             found = residuals(r)
             return found[0] <= tolerance and found[1] <= limit
 
-        p = None
-        if not is_dense:
-            p = self._store(sp.bsr_matrix(W, blocksize=(3, 3)), b, friction, r, method)
-        elif found := semismooth.solve(W, b, friction, r, own, holds, NEAR * tolerance, NEWTON):
-            return found[0], SolveResult(found[1], residuals(found[0])[0], True)
-        goal, result = tolerance, SolveResult(0, math.inf, False)
-        for _ in range(1 if factor is None else TIGHTER):
-            if p is not None:
-                result = solve(p, method, goal, sweeps)
-                r, iterations = p.r.to_numpy(len(friction)), iterations + result.iterations
-                if result.converged and holds(r):
-                    break
-            if not result.converged:
-                r, history = augmented_lagrangian.solve(sp.csr_matrix(W), b, friction, r, goal, outer)
-                iterations += len(history) - 1
-                result = SolveResult(iterations, history[-1], history[-1] <= goal)
+        def by_augmented_lagrangian(goal: float) -> tuple[np.ndarray, SolveResult]:
+            found, history = augmented_lagrangian.solve(sp.csr_matrix(W), b, friction, r, goal, outer)
+            return found, SolveResult(iterations + len(history) - 1, history[-1], history[-1] <= goal)
+
+        if isinstance(W, np.ndarray):
+            if found := semismooth.solve(W, b, friction, r, own, holds, NEAR * tolerance, NEWTON):
+                return found[0], SolveResult(found[1], residuals(found[0])[0], True)
+            goal = tolerance
+            for _ in range(TIGHTER):
+                r, result = by_augmented_lagrangian(goal)
+                iterations, (reached, other) = result.iterations, residuals(r)
                 if not result.converged or holds(r):
                     break
-                if p is not None:
-                    p.r.from_numpy(r, 0)
+                goal = 0.5 * reached * limit / max(other, limit)
+            return r, replace(result, converged=holds(r))
+        p, goal = self._store(sp.bsr_matrix(W, blocksize=(3, 3)), b, friction, r, method), tolerance
+        for _ in range(1 if factor is None else TIGHTER):
+            result = solve(p, method, goal, sweeps)
+            r, iterations = p.r.to_numpy(len(friction)), iterations + result.iterations
+            result = replace(result, iterations=iterations)
+            if result.converged and holds(r):
+                break
+            if not result.converged:
+                r, result = by_augmented_lagrangian(goal)
+                iterations = result.iterations
+                if not result.converged or holds(r):
+                    break
+                p.r.from_numpy(r, 0)
             goal *= 0.5 * limit / max(residuals(r)[1], limit)
-        return r, replace(result, iterations=iterations)
+        return r, result
 
     def _store(self, W: sp.bsr_matrix, b: np.ndarray, friction: np.ndarray, r: np.ndarray, method: str) -> ContactProblem:
         """Return the problem in fields."""

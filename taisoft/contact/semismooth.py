@@ -5,7 +5,7 @@ normal impulse. Redundant contacts, whose W is singular, are separated by a shif
 the contacts that slip, stick and separate are found. Where that cycles, a larger shift is tried: in 780 problems of four scenes
 steps that were shortened until |F| fell failed in 220, full ones with the first of SHIFTS in 22, with all three in 3.
 Source: Alart and Curnier, "A mixed formulation for frictional contact problems prone to Newton like solution methods", CMAME 92,
-1991. Weakness: far from the solution it may cycle; sweeps help then.
+1991. Weakness: far from the solution it may cycle.
 """
 
 from collections.abc import Callable

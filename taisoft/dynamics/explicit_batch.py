@@ -4,8 +4,8 @@ Eight launches are a sub-step: fill the contact problem from the last search, pr
 the paths, search at the end, and accept. Where triangles can touch each other, there is no search in a batch: it keeps the
 contacts of the one before it, see `search_ahead`. What the host would have to decide is an event: it stops the batch, so that
 later launches do nothing, and the host takes over there, by the code of single sub-steps. No sub-step is accepted without the
-check of its paths. In scenes where obstacles rest, with bodies without rigid parts, dependent or prescribed nodes and Maxwell
-branches, under loads that do not change. Others take single sub-steps.
+check of its paths. In scenes where obstacles rest, beside meshes only half-spaces, with bodies without rigid parts, dependent or
+prescribed nodes and Maxwell branches, under loads that do not change. Others take single sub-steps.
 """
 
 import numpy as np
@@ -27,6 +27,7 @@ from taisoft.dynamics.search_ahead import SLACK
 from taisoft.dynamics.simulation_state import SimulationState
 from taisoft.dynamics.state import StepState
 from taisoft.fem.state import EVENT, GO
+from taisoft.scene.obstacles import HalfSpace
 
 MOST = 32  # sub-steps of a batch
 # events, in the order in which a sub-step may meet them; OUTDATED: it is accepted, but the next one needs another search
@@ -139,7 +140,9 @@ class Batch:
         self.tally, self.event = np.zeros(N_TALLY), NOTHING
         m = simulation.model
         is_plain = not (m.viscous or m.has_rigid_tets or m.has_dependents or work.has_prescribed or simulation.ramp)
-        self._keeps = contact.detection.has_pairs
+        # the normals of contacts with planes stay, whatever moves: the slack says nothing about bodies that pass round obstacles
+        has_planes = all(isinstance(one.shape, HalfSpace) for one in simulation.scene.obstacles)
+        self._keeps = contact.detection.has_pairs and has_planes
         self._suits = is_plain and (contact.detection.only_shapes or self._keeps)
         self._slack = SLACK * float(contact.detection.edges[: len(simulation.scene.bodies)].min())
 
@@ -147,8 +150,7 @@ class Batch:
         """Return whether the next sub-steps may be a batch."""
         simulation, contact = self._simulation, self._contact
         is_free = simulation.now.none_cross and not len(simulation.now.held.pairs) and not contact.has_paths
-        n = contact.n_contacts if self._keeps else contact.detection.counts.contacts
-        return self._suits and is_free and not simulation.loads.vary and n <= MOST_OF_TEAM
+        return self._suits and is_free and not simulation.loads.vary and contact.n_contacts <= MOST_OF_TEAM
 
     @property
     def asks_for_far(self) -> bool:

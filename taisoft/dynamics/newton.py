@@ -223,7 +223,8 @@ class Newton:
         """Whether the next frictional problem takes the factor of the last one, which led near enough."""
         near = self.NEAR * self.stage.tolerance * self.scale
         is_slow = self.keeps and self.solved > self.REBUILD_RATIO * self.solved_before
-        self.keeps = self.solved <= Friction.ROUNDING * self.system.floor or (self.solved <= near and not is_slow)
+        near = max(near, Friction.ROUNDING * self.system.floor)
+        self.keeps = self.solved <= near and not (is_slow or self.is_projected)
         return self.keeps
 
     def _iterate(self) -> bool:

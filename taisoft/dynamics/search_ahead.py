@@ -3,9 +3,10 @@
 Its contacts are kept: their features, normals and weights stay, the gaps follow the motion. It is made along x + t v, t up to the
 end of the last sub-step that it may serve, so it finds what comes near until then. A new one is needed earlier once the nodes of
 contacts have moved by more than a slack, motion in common left out: up to there, a gap changes linearly but for the slack times
-the angle by which surfaces turn or bend. Nothing but accuracy rests on the slack, since the path of each sub-step is checked,
-among the triangles that were near at the search: no others can touch while no vertex leaves its searched path by half the reach.
-One that does is an event, as is a path that is not free.
+the angle by which surfaces turn or bend. That holds between meshes and over half-spaces; beside other obstacles no contacts are
+kept, as a body can pass them as a whole. Accuracy alone rests on the slack, since the path of each sub-step is checked, among the
+triangles that were near at the search: no others can touch while no vertex leaves its searched path by half the reach. One that
+does is an event, as is a path that is not free.
 
 All that the coming sub-steps depend on is kept in checkpoints. A search that a question has made meanwhile is undone by repeating
 this one.

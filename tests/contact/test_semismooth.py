@@ -3,14 +3,15 @@
 * from a start near them it finds impulses that stick, slip and open as the laws of Signorini and Coulomb demand, also where
   contacts are redundant, so that W is singular;
 * its derivative is that of the projection onto the laws, and its limit of iterations holds;
-* it gives up where there is no solution, and on what is not finite.
+* it gives up where there is no solution, and on what is not finite; then the augmented Lagrangian takes over.
 """
 
 import numpy as np
 import pytest
 
 from taisoft.contact import semismooth
-from taisoft.contact.augmented_lagrangian import find_factors, find_residual, prox
+from taisoft.contact.augmented_lagrangian import find_factors, find_residual, prox, residual_at
+from taisoft.contact.matrix_contacts import MatrixContacts
 from tests.contact import contact_oracle as oracle
 
 TOLERANCE = 1e-10
@@ -117,3 +118,13 @@ def test_it_gives_up_where_it_cannot_solve():
     assert solved(pinch, np.array([-1.0, 0, 0, -1.0, 0, 0]), mu, start) is None
     assert solved(np.eye(6), np.full(6, np.nan), mu, start) is None
     assert solved(np.full((6, 6), np.nan), np.zeros(6), mu, start) is None
+
+
+def test_where_it_fails_the_augmented_lagrangian_takes_over(monkeypatch):
+    """To both bounds: that with the factors of W, and that with others."""
+    W, b, mu, r = random_problem(7)
+    monkeypatch.setattr(semismooth, "solve", lambda *_: None)
+    factor, limit = 100.0 * find_factors(W), 1e-6
+    found, result = MatrixContacts(True).solve(W, b, mu, prox(0.5 * r, mu), "gauss_seidel", 1e-3, 10, factor=factor, limit=limit)
+    assert result.converged and np.abs(found - r).max() < 1e-4
+    assert residual_at((W @ found.reshape(-1) + b).reshape(-1, 3), mu, factor, found) <= limit
