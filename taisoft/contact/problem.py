@@ -270,6 +270,13 @@ def to_frame(problem: ti.template(), c, v):
 
 
 @ti.func
+def frame_of(problem: ti.template(), c):
+    """Rows normal, t1, t2 of contact c (3,3)."""
+    n, t = problem.normal[c], problem.tangent[c]
+    return ti.Matrix.rows([n, t, n.cross(t)])
+
+
+@ti.func
 def to_world(problem: ti.template(), c, r):
     """Transform a vector from the frame of contact c to the world."""
     n, t = problem.normal[c], problem.tangent[c]
@@ -381,8 +388,7 @@ def own_block(problem: ti.template(), c):
                 for i, j in ti.static(ti.ndrange(3, 3)):
                     B[i, j] += problem.block[k, 3 * i + j]
     else:
-        n, t = problem.normal[c], problem.tangent[c]
-        E = ti.Matrix.rows([n, t, n.cross(t)])
+        E = frame_of(problem, c)
         h = dvec(0.0)
         for e in range(problem.first[c], problem.first[c] + problem.arity[c]):
             h += problem.weight[e] * problem.weight[e] * problem.inverse_mass[problem.node[e]]

@@ -14,7 +14,7 @@ import taichi as ti
 
 from taisoft.backend.arrays import FieldArena
 from taisoft.backend.runtime import kernel
-from taisoft.contact.problem import ContactProblem, residual_of
+from taisoft.contact.problem import ContactProblem, residual_of, to_world
 from taisoft.contact.prox import OPEN, dvec, into_disk, prox, scaled, state_of
 from taisoft.contact.targets import contact_offset_of
 from taisoft.fem.model import Model
@@ -195,8 +195,7 @@ def update_contact(m: ti.template(), contacts: ti.template(), c, beta, r_scale):
         rows.status[c] = state
     world_impulse, d = dvec(0.0), dvec(0.0)
     if not opens:
-        n, t1 = rows.normal[c], rows.tangent[c]
-        world_impulse = r[0] * n + r[1] * t1 + r[2] * n.cross(t1)
+        world_impulse = to_world(rows, c, r)
         _set_block(m, contacts, c, z, r_scale)
     elif work.active[c] == 1:
         work.block[c], work.active[c] = ti.Vector.zero(m.real, BLOCK), 0

@@ -14,7 +14,7 @@ import taichi as ti
 
 from taisoft.backend.arrays import Count, FieldArena
 from taisoft.backend.runtime import kernel
-from taisoft.contact.problem import ContactProblem, residual_of, to_frame
+from taisoft.contact.problem import ContactProblem, frame_of, residual_of, to_frame
 from taisoft.contact.prox import dvec, prox, scaled
 from taisoft.dynamics.contact_terms import stage_velocity_of
 from taisoft.fem.model import Model
@@ -82,8 +82,7 @@ def _fill_rows(m: ti.template(), p: ti.template(), w: ti.template(), Y: ti.templ
     ti.loop_config(serialize=True)
     for c in range(p.count[0]):
         if w.number[c] != NONE:
-            n, t = p.normal[c], p.tangent[c]
-            frame = ti.Matrix.rows([n, t, n.cross(t)])
+            frame = frame_of(p, c)
             n_rows = 3 if p.friction[c] != 0.0 else 1
             for e in range(p.first[c], p.first[c] + p.arity[c]):
                 i = p.node[e]

@@ -8,7 +8,7 @@ import numpy as np
 import taichi as ti
 
 from taisoft.backend.runtime import kernel
-from taisoft.contact.problem import ContactProblem
+from taisoft.contact.problem import ContactProblem, frame_of
 from taisoft.contact.prox import dvec
 from taisoft.fem.model import Model
 from taisoft.linear.block_csr import BlockCsr, unpacked
@@ -39,7 +39,7 @@ def _set_factors(m: ti.template(), p: ti.template()):
     """Set the factors of the contacts with rigid bodies, by the inverse of each body's block."""
     ti.loop_config(serialize=True)
     for c in range(p.count[0]):
-        frame = ti.Matrix.rows([p.normal[c], p.tangent[c], p.normal[c].cross(p.tangent[c])])
+        frame = frame_of(p, c)
         compliance, is_rigid = dvec(0.0), 0  # the former: the diagonal of W
         for e in range(p.first[c], p.first[c] + p.arity[c]):
             i, at = p.node[e], m.rigid_tets.number[p.node[e]]

@@ -24,9 +24,8 @@ class FrictionalProblems:
         self._system, self._stage = system, stage
         self.tight = False  # whether the last problem was near the floor
         self._was_direct = False  # whether it was solved directly
-        self._is_trial = system.n_direct >= min(
-            self.TRIAL << system.n_in_vain, self.RAREST
-        )  # whether the stage's first problem is one
+        # whether the stage's first problem is one
+        self._is_trial = system.n_direct >= min(self.TRIAL << system.n_in_vain, self.RAREST)
         self._law_aim = stage.law_aim
         self._r_scale, self._max_r_scale = FIRST_R, MAX_R_FRICTIONLESS
 
