@@ -1,7 +1,6 @@
 """Contact problems of a step as matrices: J, and the solution for a W assembled on the host, in fields that are kept."""
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import scipy.sparse as sp
@@ -38,13 +37,13 @@ class MatrixContacts:
         factor: np.ndarray | None = None,
         limit: float = math.inf,
     ) -> tuple[np.ndarray, SolveResult]:
-        """Return impulses (k,3), from the start r (k,3), and the result; by sweeps, Newton's method if W is an array, or else by
-        an augmented Lagrangian.
+        """Return impulses (k,3), from the start r (k,3), and the result: by Newton's method if W is an array, else by sweeps, and
+        by an augmented Lagrangian where these fail.
 
         W: (3k,3k); b: (3k,); friction: (k,); method, tolerance, sweeps: as in `contact.solve.solve`; outer: maximum iterations of
         the augmented Lagrangian. factor, limit: other r-factors (k,2), and a bound on the residual with these.
         """
-        own, iterations = augmented_lagrangian.find_factors(W), 0
+        own = augmented_lagrangian.find_factors(W)
 
         def residuals(r: np.ndarray) -> tuple[float, float]:
             u = (W @ r.reshape(-1) + b).reshape(-1, 3)
@@ -54,38 +53,28 @@ class MatrixContacts:
             found = residuals(r)
             return found[0] <= tolerance and found[1] <= limit
 
-        def by_augmented_lagrangian(goal: float) -> tuple[np.ndarray, SolveResult]:
-            found, history = augmented_lagrangian.solve(sp.csr_matrix(W), b, friction, r, goal, outer)
-            return found, SolveResult(iterations + len(history) - 1, history[-1], history[-1] <= goal)
-
-        if isinstance(W, np.ndarray):
-            if found := semismooth.solve(W, b, friction, r, own, holds, NEAR * tolerance, NEWTON):
-                return found[0], SolveResult(found[1], residuals(found[0])[0], True)
-            goal = tolerance
-            for _ in range(TIGHTER):
-                r, result = by_augmented_lagrangian(goal)
-                iterations, (reached, other) = result.iterations, residuals(r)
-                if not result.converged or holds(r):
-                    break
-                goal = 0.5 * reached * limit / max(other, limit)
-            return r, replace(result, converged=holds(r))
-        p, goal = self._store(sp.bsr_matrix(W, blocksize=(3, 3)), b, friction, r, method), tolerance
-        for _ in range(1 if factor is None else TIGHTER):
-            result = solve(p, method, goal, sweeps)
-            r, iterations = p.r.to_numpy(len(friction)), iterations + result.iterations
-            result = replace(result, iterations=iterations)
-            if result.converged and holds(r):
-                break
-            if not result.converged:
-                r, result = by_augmented_lagrangian(goal)
-                iterations = result.iterations
-                if not result.converged or holds(r):
-                    break
+        p, goal, iterations = None, tolerance, 0
+        if not isinstance(W, np.ndarray):
+            p = self._store(sp.bsr_matrix(W, blocksize=(3, 3)), b, friction, method)
+        elif found := semismooth.solve(W, b, friction, r, own, holds, NEAR * tolerance, NEWTON):
+            return found[0], SolveResult(found[1], residuals(found[0])[0], True)
+        for _ in range(TIGHTER):
+            result = None
+            if p is not None:
                 p.r.from_numpy(r, 0)
-            goal *= 0.5 * limit / max(residuals(r)[1], limit)
-        return r, result
+                result = solve(p, method, goal, sweeps)
+                r, iterations = p.r.to_numpy(len(friction)), iterations + result.iterations
+            if result is None or not result.converged:
+                r, history = augmented_lagrangian.solve(sp.csr_matrix(W), b, friction, r, goal, outer)
+                result = SolveResult(len(history) - 1, history[-1], history[-1] <= goal)
+                iterations += result.iterations
+            reached, other = residuals(r)
+            if not result.converged or holds(r):
+                break
+            goal = 0.5 * reached * (limit / other if other > limit else 1.0)
+        return r, SolveResult(iterations, reached, holds(r))
 
-    def _store(self, W: sp.bsr_matrix, b: np.ndarray, friction: np.ndarray, r: np.ndarray, method: str) -> ContactProblem:
+    def _store(self, W: sp.bsr_matrix, b: np.ndarray, friction: np.ndarray, method: str) -> ContactProblem:
         """Return the problem in fields."""
         p, k = self._problem, len(friction)
         if p is None or p.capacity < k or p.column.shape[0] < len(W.indices):
@@ -94,7 +83,6 @@ class MatrixContacts:
             self.release()
             self._arena = arena
         fill_matrix_problem(p, W, b, friction)
-        p.r.from_numpy(r, 0)
         if method == "coloured_gauss_seidel":
             store(p, colour_greedy(matrix_graph(W)))
         return p

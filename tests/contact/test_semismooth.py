@@ -3,6 +3,7 @@
 * from a start near them it finds impulses that stick, slip and open as the laws of Signorini and Coulomb demand, also where
   contacts are redundant, so that W is singular;
 * its derivative is that of the projection onto the laws, and its limit of iterations holds;
+* where the first shift cycles another takes over;
 * it gives up where there is no solution, and on what is not finite; then the augmented Lagrangian takes over.
 """
 
@@ -106,9 +107,24 @@ def test_the_derivative_is_that_of_the_projection():
 def test_a_solution_needs_no_iterations_and_too_few_give_none():
     W, b, mu, r = random_problem(5)
     assert solved(W, b, mu, r, most=0)[1] == 0
-    start = prox(r + 0.02 * np.random.default_rng(5).standard_normal(r.shape), mu)
+    start = prox(r + 0.5 * np.random.default_rng(5).standard_normal(r.shape), mu)
     n = solved(W, b, mu, start)[1]
-    assert n > 1 and solved(W, b, mu, start, most=n)[1] == n and solved(W, b, mu, start, most=n - 1) is None
+    too_few = (n - 1) // len(semismooth.SHIFTS)
+    assert too_few > 0 and solved(W, b, mu, start, most=n)[1] == n and solved(W, b, mu, start, most=too_few) is None
+
+
+@pytest.mark.parametrize("k, friction, seed", [(4, 0.8, 20), (4, 0.8, 26), (8, 0.3, 12), (8, 0.3, 24)])
+def test_where_the_first_shift_cycles_another_takes_over(monkeypatch, k, friction, seed):
+    """Contacts of one rigid body, from impulses of 0; earlier than after all iterations."""
+    rng, mu = np.random.default_rng(seed), np.full(k, friction)
+    J = rng.standard_normal((3 * k, 6))
+    problem = J @ J.T + 1e-3 * np.eye(3 * k), J @ rng.standard_normal(6), mu
+    found, n = solved(*problem, np.zeros((k, 3)), most=20)
+    assert max(oracle.breaks(*problem, found).values()) < 1e-8
+    monkeypatch.setattr(semismooth, "MAX_RISING", 99)
+    assert n < solved(*problem, np.zeros((k, 3)), most=20)[1]
+    monkeypatch.setattr(semismooth, "SHIFTS", semismooth.SHIFTS[:1])
+    assert solved(*problem, np.zeros((k, 3)), most=20) is None
 
 
 def test_it_gives_up_where_it_cannot_solve():
