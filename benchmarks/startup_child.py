@@ -82,11 +82,11 @@ def simulator(name: str, cells: int) -> ts.Simulator:
 
 
 def simulate(name: str, cells: int, steps: int = 10, hard: bool = False) -> None:
-    """Build a simulator and run its first steps. hard: also compile the kernels of steps that are hard to solve."""
+    """Build a simulator and run its first steps. hard: also compile the kernels of all others."""
     with simulator(name, cells) as sim:
         walk(sim, steps)
-        if hard and hasattr(sim._dynamics.stepper, "compile_hard_steps"):
-            sim._dynamics.stepper.compile_hard_steps()
+        if hard:
+            sim.warm_up()
 
 
 def walk(sim: ts.Simulator, steps: int) -> None:

@@ -125,6 +125,12 @@ class Simulator(Guarded):
             warnings.warn(text, UserWarning, stacklevel=2)
         return report
 
+    def warm_up(self) -> None:
+        """Compile, or load from disk, what later steps need, such as the first one in which something touches: none waits for it
+        then. For what must keep up with the clock; takes some seconds. The state stays. Raises SimulationError as `step` does.
+        """
+        self._open().warm_up()
+
     run = running.run
 
     def _begin_estimate(self, steps: int, mesh: str | Scene | None, measured: dict) -> "ErrorEstimator":

@@ -4,26 +4,20 @@ Kernels depend on what a scene holds, and little on its meshes and numbers, so t
 names the demos are compiled, their pictures, and statics.
 """
 
-import contextlib
 import time
 import warnings
 from argparse import Namespace
 from collections.abc import Callable
-
-import numpy as np
 
 import taisoft as ts
 from taisoft import compile_message
 from taisoft.backend.runtime import n_compiled
 from taisoft.cli.run import RUN_KEYS
 from taisoft.cli.scene_file import load_scene, shipped_files
-from taisoft.errors import MissingPackage, SimulationError
+from taisoft.errors import MissingPackage
 from taisoft.static import solve_static
 from taisoft.view.offscreen import Offscreen
 
-STEPS = 4  # at least, and then until something touches
-SECONDS = 20.0  # wall time of a scene's steps, at most
-RANDOM_SPEED = 0.5  # of nodes, in smallest extents of the scene per step
 PICTURED, HELD = "drop_test", "hanging_beam"  # the demos whose pictures and statics are compiled
 
 
@@ -57,19 +51,9 @@ def _report(title: str, compile_for: Callable, *given, **named) -> None:
 
 
 def simulate(scene: ts.Scene, settings: dict) -> None:
-    """Take steps until something touches, a hard one, and compute what a run with --out writes."""
-    end = time.monotonic() + SECONDS
+    """Warm up, and compute what a run with --out writes."""
     with ts.Simulator(scene, **settings) as sim:
-        report = sim.step()
-        while (sim.step_count < STEPS or (sim.touches and report.n_contacts == 0)) and time.monotonic() < end:
-            report = sim.advance(STEPS)
-        if not sim.settings.explicit:
-            sim._dynamics.stepper.compile_hard_steps()
-            x = sim.positions()
-            speed = RANDOM_SPEED * float(np.ptp(x, axis=0).min()) / sim.dt
-            sim.set_state(velocities=speed * np.random.default_rng(0).standard_normal(x.shape))
-            with contextlib.suppress(SimulationError):  # a step that fails has compiled its kernels all the same
-                sim.step()
+        sim.warm_up()
         sim.energies()
         sim.stress()
 

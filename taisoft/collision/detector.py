@@ -25,7 +25,7 @@ from taisoft.collision.end_search import EndSearch, place_at_end
 from taisoft.collision.features import BY_EDGES, BY_FACES, BY_FIELD
 from taisoft.collision.intersections import CROSSINGS_OF, INTERSECTING, find_crossings
 from taisoft.collision.mortar import find_mortar
-from taisoft.collision.near_list import STILL
+from taisoft.collision.near_list import STILL, TO_STATE
 from taisoft.collision.overlay import build_overlay, overlay_points
 from taisoft.collision.passages import append_passages
 from taisoft.collision.path_check import IN_BOXES, NO_PASSAGES, HeldPassages, PathCheck
@@ -300,6 +300,12 @@ class Detection:
             find_analytic(s, shapes, self.margin, out, append)
             append = 1
         return append
+
+    def warm_up(self) -> None:
+        """Launch the kernels that only passages need, on none."""
+        append_passages(self.surface, self.shapes, self.paths.fields, *NO_PASSAGES, self.buffer.parts, 1)
+        self.bends(TO_STATE)
+        self.paths.find_inwards(self.model.state.x, TO_STATE)
 
     def adopt(self, found: int, kept: int) -> None:
         """Take over the numbers of contacts of a search that was not read, in a scene with `only_shapes`."""

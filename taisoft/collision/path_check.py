@@ -195,12 +195,16 @@ class PathCheck:
             self._inwards = self._arena.vectors("inwards", ti.f64, n)
         if not self._is_leg_free(x, broad, row, mode, 0.0, 1.0, 1.0):  # the end, where a bent path is not bent
             return False
-        find_inwards(self.surface, x, int(mode == SEARCHED), self._inwards)
+        self.find_inwards(x, mode)
 
         def is_free(legs: int, depth: float) -> bool:
             return all(self._is_leg_free(x, broad, row, mode, depth, k / legs, (k + 1) / legs) for k in range(legs))
 
         return any(is_free(legs, part * margin) for legs, part in TRIALS)
+
+    def find_inwards(self, x, mode: int) -> None:
+        """See `bent_path.find_inwards`."""
+        find_inwards(self.surface, x, int(mode == SEARCHED), self._inwards)
 
     def _is_leg_free(self, x, broad, row: Buffer | None, mode: int, depth: float, begin: float, end: float) -> bool:
         """Return whether nothing passes on a leg, see `bent_path.set_leg`, or crosses there if its begin is its end.

@@ -715,6 +715,16 @@ class ContactStep:
             self._searched = None  # where none cross, other contacts are found
         return self.crossing
 
+    def warm_up(self, time: float, dt: float, x_start: Any, displacement: Any) -> None:
+        """Launch the kernels that only steps with contacts need, after a search at a time for a step of dt [s]; the state and the
+        contacts are then invalid."""
+        self.detection.warm_up()
+        self._renewal.warm_up(self.problem, self.numbers, (time, dt), x_start, displacement, self.contact_offset)
+        scale_impulses(self.problem, 1.0)
+        self.measures.drop_uncertain()
+        self.misplaced.add(self.problem, dt, self.contact_offset, False)
+        end_contacts(self.problem, self.simulation.model, x_start, self.simulation.now.slip, 0.0)
+
     def contacts(self, areas: bool = False) -> Contacts:
         """Return the contacts of the last substep with their impulses. areas: whether with tributary areas."""
         rows, counts = self.rows(), dict(zip(("found", "unmapped"), self._search_counts))  # others have searched since

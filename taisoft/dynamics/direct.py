@@ -115,6 +115,18 @@ class DirectSolver:
         self._has_factor = True
         return True
 
+    def warm_up(self, stage_contacts: StageContacts, beta: float) -> None:
+        """Analyse the pattern, and launch all kernels without contacts, on a factor of zeros."""
+        if len(self._nodes) > self.MOST_NODES and not self.is_rigid:
+            return
+        if self._factor is None:
+            self._analyse()
+        m, k, w = self._model, stage_contacts, self._delassus.unknowns
+        begin_direct(m, k, w, beta)
+        self._delassus.add(k.problem, np.zeros(0, dtype=np.int64))
+        end_direct(m, k, w)
+        move_directly(m, w, self._x_hat, beta)
+
     def _factorise(self, k: StageContacts) -> None:
         """Factorise A on the free axes, without the contacts' terms."""
         free = (self._model.free.host[self._nodes] > 0.0).astype(np.float64)

@@ -142,6 +142,16 @@ class Dynamics:
         report.problems = [f"step {self.state.step_count}: {problem}" for problem in problems]
         return report
 
+    def warm_up(self) -> None:
+        """Take a step, launch what later ones may need besides, and return to the present state: see `Simulator.warm_up`."""
+        kept, before = self.snapshot(), self._velocities_before
+        try:
+            self.advance(1)
+            self.stepper.warm_up(self.state.time, self.dt)
+        finally:
+            self.restore(kept)
+            self._velocities_before = before
+
     def _failure(self, error: SimulationError) -> SimulationError:
         """Return a step's error with the step's number; if the state at its start was not finite, name that place instead."""
         self.runtime.check()  # raises its own error

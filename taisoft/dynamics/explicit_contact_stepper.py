@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from taisoft.contact.build import end_contacts
 from taisoft.contact.colouring import colour_contacts
 from taisoft.contact.solve import SolveResult, solve, sweeps_per_launch, team_of
 from taisoft.dynamics.contact import BLOCKED, FREE, MAX_PASSAGES, TOLERANCE, ContactStep
@@ -29,6 +30,7 @@ from taisoft.dynamics.explicit_contact import begin_solve, finish_verlet, move, 
 from taisoft.dynamics.explicit_stepper import ExplicitStepper
 from taisoft.dynamics.results import StepResult
 from taisoft.dynamics.rigid_contacts import RigidContacts
+from taisoft.dynamics.search_ahead import MOST as SEARCHED_ONCE
 from taisoft.dynamics.simulation_state import SimulationState
 from taisoft.errors import SimulationError
 from taisoft.fem.state import FAILED, LOWEST_J, MOST_INVERTED
@@ -128,6 +130,23 @@ class ContactExplicitStepper(ExplicitStepper):
         elif not result.converged:
             result.problems.append(f"the contact solver stopped at a residual of {result.contact_residual:.2e}")
         return result
+
+    def warm_up(self, time: float, dt: float) -> None:
+        """Launch the kernels that only sub-steps of dt with contacts need, after one that has ended at a time; the state is then
+        invalid."""
+        contact, model, work = self.contact, self.simulation.model, self.work
+        contact.begin(time, dt)
+        problem, surface, limits = contact.problem, contact.detection.surface, (self.method, self.contact_tolerance)
+        predict(model, work, problem, surface, dt, *contact.gap_targets)
+        begin_solve(problem, team_of(problem, self.method, 0)[0], surface, *limits, sweeps_per_launch(0), MAX_SWEEPS, NOTHING)
+        solve(problem, *limits, MAX_SWEEPS)
+        move(model, work, problem, surface, dt, NOTHING)
+        contact.detection.warm_up()
+        contact.paths.keep_path(self.good.x)
+        end_contacts(problem, model, self.good.x, self.simulation.now.slip, dt)
+        if self.batch.suits():
+            self._take_batch(SEARCHED_ONCE, time, dt, np.zeros(N_TALLY))
+            run_on(surface)
 
     def _take_batch(self, n: int, time: float, dt: float, tally: np.ndarray) -> int:
         """Take a batch of up to n sub-steps from a time, and add it to the tally. Return the event that ended it early."""

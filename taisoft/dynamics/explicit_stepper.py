@@ -154,6 +154,9 @@ class ExplicitStepper:
     def wake(self, *names: str) -> None:
         """Do nothing: nothing sleeps in explicit steps."""
 
+    def warm_up(self, time: float, dt: float) -> None:
+        """Do nothing: a step has launched all kernels."""
+
     def settle(self, dt: float, is_solved: bool) -> None:
         """Do nothing either."""
 

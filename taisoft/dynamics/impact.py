@@ -158,6 +158,17 @@ def release_contacts(rows: ti.template()):
         rows.min_opening[c] = 0.0
 
 
+def warm_up(system: StageSystem) -> None:
+    """Launch the kernels of an impact on the present stage, whose state is then invalid."""
+    m, w, k, tau = system.model, system.work, system.contacts, SPREAD * system.stage.dt
+    begin_impact(m, w, k, tau)
+    measure_impact(m, w, k, tau)
+    apply_impact(m, w, k, 1.0)
+    release_contacts(k.problem)
+    start_from(m, w, 0.0)
+    rebound_work(k, tau)
+
+
 def solve_bouncing(system: StageSystem, stage: Stage) -> StageResult:
     """Solve a step of implicit Euler with restitution: the impact, then the stage, whose rebounds do no more work than it has."""
     m, w, tau = system.model, system.work, SPREAD * stage.dt

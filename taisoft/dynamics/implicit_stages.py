@@ -12,10 +12,10 @@ import taichi as ti
 
 from taisoft.backend.arrays import download, upload
 from taisoft.backend.runtime import kernel
+from taisoft.dynamics import impact
 from taisoft.dynamics.contact import TOLERANCE, ContactStep
 from taisoft.dynamics.friction import extrapolate_multipliers
 from taisoft.dynamics.imbalance import describe_imbalance
-from taisoft.dynamics.impact import solve_bouncing
 from taisoft.dynamics.multipliers import Multipliers
 from taisoft.dynamics.newton import solve
 from taisoft.dynamics.no_contacts import NoContacts
@@ -149,7 +149,7 @@ class ImplicitStages:
         simulation, solver = self.simulation, self.solver
         scheme, bounces = self._prepare(time, dt, start)
         stage = replace(self._stage(scheme, dt, self.tolerance), renews=not bounces)
-        result = solve_bouncing(solver, stage) if bounces else solve(solver, stage)
+        result = impact.solve_bouncing(solver, stage) if bounces else solve(solver, stage)
         if scheme.one_iteration and solver.pieces.several and result.converged and np.isfinite(result.residual):
             result = self._balance(scheme, stage, result, may_repeat=not (bounces or solver.budget.is_out_of_time()))
         if not (result.converged or solver.budget.ran_out):
@@ -260,12 +260,19 @@ class ImplicitStages:
             law_aim=self._law_aim,
         )
 
-    def compile_hard_steps(self) -> None:
-        """Compile the kernels that only hard steps need, by running them on the current stage; its state is then invalid."""
-        self.solver.form_matrix(projected=True)
-        self.solver.linear_residual()  # multiplies by the matrix, as multigrid does
-        if self.solver.n_contacts:
-            extrapolate_multipliers(self.solver.contacts, 0)
+    def warm_up(self, time: float, dt: float) -> None:
+        """Launch the kernels that only later steps of dt may need, after a step that has ended at a time; the state is then
+        invalid."""
+        if self.contact.idle:
+            self.solver.warm_up()
+            return
+        self.contact.begin(time, dt)
+        self.solver.warm_up()
+        extrapolate_multipliers(self.solver.contacts, 0)
+        if self.simulation.scene.bounces:
+            self.contact.rebounds.detect(self.contact.problem, dt, self.contact.contact_offset)
+            impact.warm_up(self.solver)
+        self.contact.warm_up(time, dt, self.start.x, self.solver.contacts.displacement)
 
     def reactions(self) -> np.ndarray:
         """Return the constraint forces of the last step, (n_nodes, 3) [N]."""

@@ -1,5 +1,6 @@
 """Renewal of the contacts' geometry at the iterates of an implicit stage, see `contact_geometry`."""
 
+import math
 from typing import Any
 
 import numpy as np
@@ -70,6 +71,21 @@ class Renewal:
         adopt(problem, model, s, shapes, numbers, x_start, displacement, found, kept, n)
         index_nodes(problem)
         return True
+
+    def warm_up(
+        self, problem: ContactProblem, numbers: PairNumbers, times: tuple, x_start: Any, displacement: Any, offset: float
+    ) -> None:
+        """Launch all kernels, as if no contacts had been found. times: see `look`, of the last search."""
+        model, detection = self._model, self._detection
+        s, shapes, lengths = detection.surface, detection.shapes, (times[1], offset, detection.margin, detection.floor)
+        largest_motion(problem, shapes, displacement, self._seen, 0)
+        copy_values(model, self._seen, displacement)
+        surface, found, kept, _ = detection.find_at_end(*times, x_start, displacement, math.inf).found
+        if model.has_dependents:
+            drop_vanishing(problem, model, s, found, kept, 0, 0, 0)
+        judge(problem, s, surface, shapes, x_start, displacement, found, kept, 0, *lengths)
+        adopt(problem, model, s, shapes, numbers, x_start, displacement, found, kept, 0)
+        index_nodes(problem)
 
     def _renew_sides(self, problem: ContactProblem, n: int) -> None:
         """Update `sides` as `adopt` will update the contacts, n of which were found."""

@@ -624,6 +624,24 @@ class StageSystem:
         self._same_matrix = True
         return solution
 
+    def warm_up(self) -> None:
+        """Launch the kernels that only stages with contacts and hard ones need, once; the state is then invalid."""
+        self.form_matrix(projected=True)
+        self.linear_residual()  # multiplies by the matrix, as multigrid does
+        if self.step_contacts.idle:
+            return
+        self.begin_contacts()
+        self.form_matrix_and_factors()
+        self.evaluate_start()
+        self.linearise()
+        self.solve_linear(1.0)
+        self.advance(self.r_scale)
+        self.update_multipliers(self.r_scale, to_impulses=True)
+        if self._direct is not None:
+            self._direct.warm_up(self.contacts, self.stage.beta)
+        self.end_linearised()
+        self.balance_rigid_motion()
+
     def last_correction(self) -> float:
         """Return the largest displacement by y, the last change of v [m]."""
         (y,) = download([self.work.pcg.y])

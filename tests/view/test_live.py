@@ -18,9 +18,10 @@ from tests.view.fake_simulator import FakeSimulator, beam_scene
 
 
 class Clock(FakeSimulator):
-    """A simulator whose steps take a given time of its own clock. calls: steps and commands in their order."""
+    """A simulator whose steps take a given time of its own clock. calls: steps and commands in their order. warm_ups: their number,
+    each of which takes seconds_to_warm_up."""
 
-    draggable = True
+    draggable, warm_ups, seconds_to_warm_up = True, 0, 0.0
 
     def __init__(self, dt=0.01, seconds_per_step=1e-3, integrator="symplectic_euler"):
         super().__init__(beam_scene(), dt)
@@ -32,6 +33,9 @@ class Clock(FakeSimulator):
         self.calls.append(("steps", n))
         self.time, self.step_count, self.now = self.time + n * self.dt, self.step_count + n, self.now + n * self.seconds_per_step
         return StepReport(time=self.time, steps=n)
+
+    def warm_up(self):
+        self.warm_ups, self.now = self.warm_ups + 1, self.now + self.seconds_to_warm_up
 
     def drag(self, body, nodes, weights, target, stiffness):
         self.calls.append(("drag", body, tuple(target), stiffness))
@@ -135,6 +139,21 @@ def test_as_fast_as_possible_and_the_keys_of_speed(live):
     for _ in range(3):
         run.turn()
     assert window.states[-1]["asked_speed"] is None
+
+
+def test_what_steps_need_is_compiled_before_the_first_one(live):
+    """Once, after the first state was shown; and again for another solver. Its time is not made up."""
+    sim = Clock(0.01)
+    sim.seconds_to_warm_up = 3.0
+    run, window = live(sim, {50: [["rebuild", "bdf2", "auto"]]})
+    while sim.time < 0.4:
+        run.turn()
+    first = window.states[0]
+    assert first["step_count"] == 0 and first["status"] == "compiling the next step, for some seconds" and sim.warm_ups == 1
+    assert sim.time <= sim.now - 103.0 + 2 * sim.dt
+    while sim.time < 1.0:
+        run.turn()
+    assert sim.warm_ups == 2
 
 
 def test_an_implicit_step_gets_a_budget_of_the_time_in_which_it_is_due(live):

@@ -7,8 +7,8 @@ state is sent if the window has taken the previous one, or if its step has used 
 window, and the window for a step only a moment, while a body is dragged.
 
 So that it keeps up, an implicit step gets a budget of wall time (`Simulator.budget`): SHARE of the dt / speed in which it is due,
-DRAG_SHARE while a body is dragged, less what a state sent after it takes, but at least LEAST_SHARE. The first step has none, nor
-have single steps, those as fast as possible and those after the user has switched it off; one that the simulator has of its own
+DRAG_SHARE while a body is dragged, less what a state sent after it takes, but at least LEAST_SHARE. Single steps have none, nor
+have those as fast as possible and those after the user has switched it off; one that the simulator has of its own
 counts instead.
 """
 
@@ -50,7 +50,7 @@ class LiveRun:
         self._own_budget, self._sending = sim.settings.budget, 0.0  # the latter: a state [s]
         self._is_budgeted = budget or self._own_budget is not None
         self._last_speed = 1.0  # before it was unbound
-        self._compiled = False  # True after a step, since that compiles everything
+        self._is_warm = False  # whether no step has to compile anything, see `Simulator.warm_up`
         self._published = -math.inf  # wall time of the last published state
         self._changed = True  # since that
         # of the last drag: its number, the last one that a step has used, and that in the last published state
@@ -98,7 +98,7 @@ class LiveRun:
     def _advance(self) -> None:
         """Take the steps that are due; in explicit steps no more in one launch than a picture has time for."""
         dt = self.sim.dt
-        if not self._compiled:
+        if not self._is_warm:
             self._publish(PATIENCE)
         cost = self._measured["cost"] * dt
         n = 1.0 if cost == 0.0 else min(self._due() / dt + 1e-9, BATCH / cost + 0.5)
@@ -109,7 +109,7 @@ class LiveRun:
 
     def _budget(self) -> float | None:
         """Return the wall time of the next step [s], see above; None: any."""
-        is_due = self._compiled and not (self.paused or math.isinf(self.speed))
+        is_due = self._is_warm and not (self.paused or math.isinf(self.speed))
         if not self._is_budgeted or self._own_budget is not None:
             return self._own_budget if self._is_budgeted else None
         if not (is_due and self.sim.settings.tolerance is None):
@@ -118,11 +118,12 @@ class LiveRun:
         return max(LEAST_SHARE * due, share * due - self._sending * min(1.0, due / BATCH))
 
     def _take(self, n: int) -> None:
+        if not self._is_warm:
+            self.sim.warm_up()
+            self._is_warm = True
+            self._start_measuring()
         self.sim.budget = self._budget()
         timed_advance(self.sim, n, self._after_step)
-        if not self._compiled:
-            self._compiled = True
-            self._start_measuring()
         self._drag_done = self._drag_request
 
     def _after_step(self, report: StepReport, seconds: float) -> None:
@@ -211,7 +212,7 @@ class LiveRun:
         except TaisoftError as error:
             self._note.set(str(error))
             return
-        self._compiled, self.problem = False, ""
+        self._is_warm, self.problem = False, ""
         self._measured["cost"] = 0.0
         self._start_measuring()
 
@@ -273,7 +274,7 @@ class LiveRun:
     def _status(self) -> str:
         if self.paused:
             return "paused"
-        if not self._compiled:
+        if not self._is_warm:
             return "compiling the next step, for some seconds"
         cost = 0.0 if math.isinf(self.speed) else self._measured["cost"] * self.speed
         return f"running; the solver needs {cost:.1f} times as long" if cost > SLOW else "running"
