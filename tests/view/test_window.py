@@ -83,7 +83,7 @@ def test_a_window_that_does_not_open_is_an_error(simulator):
 def test_a_lost_window_is_an_error_but_a_run_goes_on(simulator, monkeypatch):
     sim, lose = simulator, OPEN + "link.receive(None); import os; os.kill(os.getpid(), 11)"
     monkeypatch.setattr("taisoft.view.window.window.CHILD", program(lose))
-    sim.advance = lambda n: sim.step()
+    sim.advance, sim.warm_up = lambda n: sim.step(), lambda: None
     with pytest.raises(OutputError, match="^the window is lost: its process ended by signal SIGSEGV$"):
         show(sim, fps=None)
     monkeypatch.setattr("taisoft.view.window.window.CHILD", program(OPEN + "link.receive(None); sys.exit(3)"))
