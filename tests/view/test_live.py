@@ -18,8 +18,8 @@ from tests.view.fake_simulator import FakeSimulator, beam_scene
 
 
 class Clock(FakeSimulator):
-    """A simulator whose steps take a given time of its own clock. calls: steps and commands in their order. warm_ups: their number,
-    each of which takes seconds_to_warm_up."""
+    """A simulator whose steps take a given time of its own clock. calls: steps and commands in their order; warm_ups: their
+    number, each of which takes seconds_to_warm_up."""
 
     draggable, warm_ups, seconds_to_warm_up = True, 0, 0.0
 
