@@ -13,6 +13,7 @@ class FrictionalProblems:
     # fractions of the stage's |r| and laws' residual to which a problem is solved, or these fractions of the tolerances, which
     # survive a full nonlinear step
     REDUCTION, LAW_REDUCTION, TOLERANCE_FRACTION, LAW_TOLERANCE_FRACTION = 0.1, 0.1, 0.6, 0.8
+    STATIC_FRACTION = 0.3  # that of the tolerance in statics, where loose problems lead from one equilibrium to others
     LAW_BALANCE = 0.03  # laws' residual over the required relative |r|; the next matrix would undo more accuracy
     MULTIPLIER_FRACTION = 0.3  # of the required |r|, ends the steps under one multiplier: updates at a large |r| overshoot
     NEAR_FLOOR = 6.0  # times the floor of |r|: below it, |r| may be mostly rigid motion
@@ -31,7 +32,8 @@ class FrictionalProblems:
 
     def goal(self, r: float, scale: float, is_balanced: bool) -> Goal:
         """Return to what the next problem is solved. r, scale: of the stage; is_balanced: whether |r| has converged."""
-        stage, norm = self._stage, max(self.REDUCTION * r, self.TOLERANCE_FRACTION * self._stage.tolerance * scale)
+        stage, fraction = self._stage, self.STATIC_FRACTION if self._system.is_static else self.TOLERANCE_FRACTION
+        norm = max(self.REDUCTION * r, fraction * stage.tolerance * scale)
         # if rounding of stiff stress hides the rigid motion in |r|, only a tight first solve gets that motion right, and impulses
         # converge only if |r| decreases with them
         self.tight = r <= self.NEAR_FLOOR * self._system.floor

@@ -216,8 +216,12 @@ class Newton:
         return not self.has_rows and self.r > ratio * self.previous > 0.0
 
     def _keeps_matrix(self) -> bool:
-        """Whether the next frictional problem takes the matrix of the last one, if that was solved by iterations."""
-        return self.solved == math.inf and not self.is_projected and self.r <= self.REBUILD_ROWS * self.previous
+        """Whether the next frictional problem takes the matrix of the last one, if that was solved by iterations.
+
+        Not in statics, where it leads from one equilibrium to others.
+        """
+        is_usable = self.solved == math.inf and not (self.is_projected or self.system.is_static)
+        return is_usable and self.r <= self.REBUILD_ROWS * self.previous
 
     def _keeps_factor(self) -> bool:
         """Whether the next frictional problem takes the factor of the last one, which led near enough."""
@@ -283,7 +287,7 @@ class Newton:
         if found.negative:
             self.r, self.scale = system.end_linearised(accept=False)
             return False
-        self.r, self.scale = system.end_linearised(solved=found.converged or found.direct)
+        self.r, self.scale = system.end_linearised(solved=found.direct or (found.converged and not system.is_static))
         self.solved_before, self.solved = self.solved, self.r if found.direct else math.inf
         if self.r < accept:
             return True
