@@ -142,10 +142,9 @@ class Trees:
             if (lo <= self.hi[node]).all() and (self.lo[node] <= hi).all():
                 step = 1  # to the first child, or past the leaf
                 if size < 0:
-                    if is_candidate(s, t, q, -1 - size) == 1:
-                        if at < last:
-                            entry[at] = -1 - size
-                        at += 1
+                    if at < last:
+                        entry[at] = -1 - size
+                    at += is_candidate(s, t, q, -1 - size)  # no branch, since nobody can predict it
             node += step
         if at <= last:
             sort_range(entry, begin, at)

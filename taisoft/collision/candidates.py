@@ -156,12 +156,12 @@ def sum_parts(team: ti.template(), parts: ti.template()):
 @ti.func
 def is_candidate(s: ti.template(), t, q, u):
     """1 if t may touch triangle u and, if q is EDGES, their edges may cross. t has a sharp edge in that case; if both have one,
-    only t < u is accepted."""
+    only t < u is accepted, as of two triangles of one collider if q is WHOLE."""
     accepted = 1
     if q == EDGES:
         accepted = int(s.sharp[u] != 0) & int(u > t or s.sharp[u] & 7 == 0)
-    if accepted == 1 and s.body[t] == s.body[u]:
-        accepted = may_touch(s, t, u)
+    if s.body[t] == s.body[u]:
+        accepted &= may_touch(s, t, u) & int(q != WHOLE or u > t)
     return accepted
 
 

@@ -176,11 +176,10 @@ def may_touch(s: ti.template(), t, u):
         if ti.static(s.has_attached):
             result &= 1 - s.attached[a * s.n_bodies + b]
     elif s.self_on[a] == 1:
-        result = 1
-        for k in range(3):
-            i = s.triangle[t, k]
-            if i == s.triangle[u, 0] or i == s.triangle[u, 1] or i == s.triangle[u, 2]:
-                result = 0
+        shared = 0
+        for k, m in ti.static(ti.ndrange(3, 3)):  # without branches, which nobody can predict
+            shared |= int(s.triangle[t, k] == s.triangle[u, m])
+        result = 1 - shared
     return result
 
 
@@ -341,14 +340,6 @@ def _list_active(surface: ti.template()):
         at, first = surface.part[c], part_first(c, surface.n_triangles, surface.chunks)
         for k in range(surface.part[c + 1] - at):
             surface.active[at + k] = surface.active_of_chunk[first + k]
-
-
-@kernel
-def update_boxes(s: ti.template(), margin: ti.f64):
-    """Update the boxes of triangles and colliders from x and move, the normals, and the active triangles."""
-    box_triangles(s, margin)
-    _box_bodies(s)
-    _list_active(s)
 
 
 @ti.func

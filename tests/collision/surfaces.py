@@ -9,7 +9,8 @@ import numpy as np
 from taisoft.backend.arrays import FieldArena
 from taisoft.collision.candidates import EDGES, WHOLE, Buffer, Candidates, Pairs, entries, pair_entries, pairs_of
 from taisoft.collision.colliders import make_topology
-from taisoft.collision.surface import build_surface, update_boxes
+from taisoft.collision.surface import build_surface, update_surface
+from taisoft.fem.state import GO
 from tests.backend.lanes import opened
 
 NEAR = Pairs()  # a visitor of all near pairs
@@ -51,7 +52,15 @@ def place(made: SimpleNamespace, x: np.ndarray, move: np.ndarray | None = None) 
     made.surface.x.from_numpy(made.x)
     made.surface.move.from_numpy(made.move)
     made.surface.padding[0] = 0.5 * made.margin
-    update_boxes(made.surface, made.margin)
+    update_boxes(made)
+
+
+def update_boxes(made: SimpleNamespace) -> None:
+    """Bring the boxes up to date with the vertices of the surface."""
+    s = made.surface
+    s.run[GO] = 0  # they stay
+    update_surface(s, s.x, s.move, False, s.move, 1.0, made.margin, True)
+    s.run[GO] = 1
 
 
 def visited_pairs(made: SimpleNamespace, broad, visitor: Pairs = NEAR, out: Buffer | None = None) -> np.ndarray:
@@ -72,7 +81,7 @@ def row_pairs(candidates: Candidates) -> np.ndarray:
 
 def near_pairs(made: SimpleNamespace, q: int = WHOLE) -> np.ndarray:
     """(k,2) triangles t and u that may touch, ascending: the swept, grown boxes of t, or of its corner q < 3, and of u overlap.
-    q = EDGES: those that are to be tested for edges."""
+    q = EDGES: those that are to be tested for edges; WHOLE: of pairs in one collider, those with t < u."""
     t, body = made.topology.triangle, made.topology.body
     ends = np.concatenate([made.x[t], (made.x + made.move)[t]], axis=1)
     finite, own = np.isfinite(ends).all(axis=(1, 2)), ends if q > 2 else ends[:, [q, 3 + q]]
@@ -86,6 +95,8 @@ def near_pairs(made: SimpleNamespace, q: int = WHOLE) -> np.ndarray:
     if q == EDGES:
         sharp = made.surface.sharp.to_numpy()
         meet &= (sharp != 0) & (np.triu(np.ones_like(meet), 1) | (sharp & 7 == 0))
+    elif q == WHOLE:
+        meet &= ~same | np.triu(np.ones_like(meet), 1)
     return np.argwhere(meet)
 
 
