@@ -190,7 +190,9 @@ class Detection:
 
             def search() -> None:
                 self._broad_result = self._near()
-                self._fill_buffer(self._broad_result, held)
+                append = self._fill_with(self._broad_result, self)
+                if len(held.pairs):
+                    append_passages(self.surface, self.shapes, self.paths.fields, *held, self.buffer.parts, append)
                 self._reduction.launch(self._lowest_gap(none_cross))
 
         unmapped = [] if self._fields is None else [self._fields.unmapped]
@@ -273,18 +275,13 @@ class Detection:
         """Run the broad phase, whose buffers may be full; None if no two surfaces can touch."""
         return self.broad.search() if self.has_pairs else None
 
-    def _fill_buffer(self, near: Trees | Candidates | None, held: HeldPassages) -> None:
-        """Write the contacts before reduction, as many as fit."""
-        append = self._fill_with(near, self)
-        if len(held.pairs):
-            append_passages(self.surface, self.shapes, self.paths.fields, *held, self.buffer.parts, append)
-
     def _scratch(self) -> list[Buffer]:
         """Buffers that every search fills."""
         return [buffer for buffer in (self._near_buffer, self._points) if buffer is not None]
 
     def _fill_with(self, near: Trees | Candidates | None, place: "Detection | EndSearch") -> int:
-        """Write the contacts of the surface and shapes at a place; return 1 if anything was searched, else 0."""
+        """Write the contacts of the surface and shapes at a place, before reduction, as many as fit; return 1 if anything was
+        searched, else 0."""
         s, shapes, out, append = place.surface, place.shapes, place.buffer.parts, 0
         if near is not None:
             row = self._near_buffer.parts

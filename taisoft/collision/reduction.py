@@ -11,7 +11,6 @@ earlier neighbours are dropped, and dropped once an earlier neighbour is kept.
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
 import taichi as ti
 
 from taisoft.backend.arrays import FieldArena
@@ -28,7 +27,7 @@ from taisoft.backend.lists import (
 )
 from taisoft.backend.runtime import kernel
 from taisoft.backend.team import Team, make_team
-from taisoft.collision.candidates import NEEDED, TOTAL, Buffer, Parts
+from taisoft.collision.candidates import NEEDED, TOTAL, Buffer
 from taisoft.collision.contacts import EDGE_EDGE, FACE_FACE, MORTAR, VERTEX_FACE
 from taisoft.collision.surface import Surface, cell_of, ivec
 
@@ -217,7 +216,7 @@ def reduce_all(work: ti.template(), out: ti.template(), inverse, tolerance, lowe
 
 @kernel
 def run_reduction(work: ti.template(), out: ti.template(), inverse: ti.f64, tolerance: ti.f64, lowest_gap: ti.f64):
-    """See `reduce_all`."""
+    """Fill work.kept and work.count for a buffer of contacts, see `reduce_all`."""
     reduce_all(work, out, inverse, tolerance, lowest_gap)
 
 
@@ -226,16 +225,8 @@ def inverse_cell(tolerance: float, cell: float) -> float:
     return 1.0 / max(cell, 2.5 * tolerance)
 
 
-def reduce_contacts(work: ReductionFields, out: Parts, tolerance: float, cell: float, lowest_gap: float = -np.inf) -> None:
-    """Fill work.kept and work.count for a buffer of contacts.
-
-    tolerance [m]; cell: edge of the cells [m]; lowest_gap [m]: of surfaces that do not cross.
-    """
-    run_reduction(work, out, inverse_cell(tolerance, cell), tolerance, lowest_gap)
-
-
 class Reduction:
-    """The reduction of one buffer of contacts, whose workspace grows with it. tolerance, cell [m]: as of `reduce_contacts`."""
+    """The reduction of one buffer of contacts, whose workspace grows with it. tolerance; cell: edge of the cells [m]."""
 
     n_found = n_kept = 0  # contacts before and after it
 
@@ -245,7 +236,7 @@ class Reduction:
 
     def launch(self, lowest_gap: float) -> None:
         """Reduce the contacts in the buffer, if they fit. lowest_gap [m]: of surfaces that do not cross."""
-        reduce_contacts(self.prepare(), self._buffer.parts, *self._lengths, lowest_gap)
+        run_reduction(self.prepare(), self._buffer.parts, *self.scales, lowest_gap)
 
     @property
     def scales(self) -> tuple[float, float]:

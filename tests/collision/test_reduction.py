@@ -13,7 +13,7 @@ from taisoft.backend.arrays import FieldArena
 from taisoft.collision import contacts as kinds
 from taisoft.collision.candidates import TOTAL, Parts
 from taisoft.collision.contacts import contact_fields
-from taisoft.collision.reduction import FOUND, LEFT, UNDECIDED, reduce_contacts, reduction_fields
+from taisoft.collision.reduction import FOUND, LEFT, UNDECIDED, inverse_cell, reduction_fields, run_reduction
 
 CAPACITY = 2**13
 SAME, OTHER = np.radians(4.0), np.radians(7.0)  # two normals at most the first apart are one; from the second on, they are two
@@ -47,7 +47,7 @@ class Reducer:
         self.used.from_numpy(used)
         self.parts.count[TOTAL] = k
         r = self.fields
-        reduce_contacts(r, self.parts, tolerance, cell, lowest_gap)
+        run_reduction(r, self.parts, inverse_cell(tolerance, cell), tolerance, lowest_gap)
         assert (r.count[FOUND], r.count[UNDECIDED]) == (k, 0)
         return np.searchsorted(places, r.kept.to_numpy()[: r.count[LEFT]])
 
