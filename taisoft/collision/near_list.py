@@ -20,6 +20,7 @@ from taisoft.backend.arrays import Count
 from taisoft.backend.lists import part_first
 from taisoft.backend.runtime import kernel
 from taisoft.collision.features import unit
+from taisoft.collision.separation import ROUNDING
 from taisoft.collision.surface import ACTIVE, dvec, may_meet
 
 SEARCHED, TO_STATE, STILL, GIVEN, ONWARD = range(5)  # which paths are checked; ONWARD: to the state, from another one since
@@ -36,6 +37,7 @@ class PathFields:
     listed_move: Any  # as are the fields of triangles
     has_pairs: bool  # whether triangles may touch each other
     can_touch: Any  # (n_verts) i32: 1 for vertices of active triangles; between checks 0
+    unfolded: Any  # (n_verts) i32: 1 where triangles around a vertex cannot meet, see `is_unfolded`
     left_lo: Any  # (2 n_bodies) vectors: boxes of the vectors by which those have left the listed paths at the start and the end
     left_hi: Any
     left: Any  # (2) i32: 1 if paths leave what was searched (UNCOVERED), or if the list is of no use for them (OUTDATED)
@@ -47,7 +49,7 @@ class PathFields:
     plane: Any  # (HINTS n_triangles) i32: of pairs of triangles, the plane that last separated them, see `hint_of`
     exempt: Any  # (n_bodies^2) i32: 1 for pairs of colliders that cross already
     first_vertex: Any  # (n_bodies + 1) i32: first vertex of each collider
-    adjacent: Any  # (n_adjacent, 6) i32: vertices of two triangles
+    adjacent: Any  # (n_adjacent, 7) i32: vertices of two triangles, and one that they have in common
     n_adjacent: Count
 
 
@@ -176,6 +178,33 @@ def _compare_with_listed(s: ti.template(), g: ti.template(), limit):
 
 
 @ti.func
+def is_unfolded(s: ti.template(), g: ti.template(), i, floor):
+    """1 if no row of `adjacent` around vertex i is a passage, since its triangles lie spread out; known without looking at rows.
+
+    Seen along n, they go round i once, each turned the same way. What joins the two sides of a row then leaves one triangle, or
+    the sector behind it, and crosses or reaches another one, or meets i: it is no shorter than their least altitude. If that
+    exceeds twice the floor and twice the motion relative to i, the plane across the shortest connection separates the sides at
+    the first advance of `free_until`; a twentieth is left for rounding.
+    """
+    x, n, turns, least, moved = s.x[i], dvec(0.0), 0, ti.cast(ti.math.inf, ti.f64), ti.cast(0.0, ti.f64)
+    for r in range(s.ring_start[i], s.ring_start[i + 1]):
+        n += s.normal[s.ring[r]]
+    across = n.cross(dvec(1.0, 2.0, 3.0))  # turns: how often the side of the plane across it changes from front to back
+    for r in range(s.ring_start[i], s.ring_start[i + 1]):
+        t = s.ring[r]
+        k = int(s.triangle[t, 1] == i) + 2 * int(s.triangle[t, 2] == i)
+        a, b = s.triangle[t, (k + 1) % 3], s.triangle[t, (k + 2) % 3]
+        e, f = s.x[a] - x, s.x[b] - x
+        height = e.cross(f).dot(n) / ti.max(e.norm(), f.norm(), (e - f).norm())
+        if s.neighbour[t, k] < 0 or s.neighbour[t, (k + 2) % 3] < 0:
+            height = 0.0
+        least, moved = ti.min(least, height), ti.max(moved, (g.path[a] - g.path[i]).norm())
+        turns += int(e.dot(across) >= 0.0) & int(f.dot(across) < 0.0)
+    needed = 2.1 * (floor + moved + ti.cast(ROUNDING, ti.f64) * ti.abs(x).max())
+    return int(turns == 1) & int(least > needed * n.norm())
+
+
+@ti.func
 def prepare_paths(surface: ti.template(), x: ti.template(), paths: ti.template(), mode, limit, listed_limit, floor):
     """Set the paths of a mode, see `passages.check_paths`, what is computed once for each triangle and vertex, and `left`.
 
@@ -186,6 +215,9 @@ def prepare_paths(surface: ti.template(), x: ti.template(), paths: ti.template()
     if ti.static(paths.has_pairs):
         _box_ends(surface, paths, floor)
         _compare_with_listed(surface, paths, listed_limit)
+        ti.loop_config(serialize=surface.serial_cheap)
+        for i in range(ti.select(paths.n_adjacent > 0, surface.n_verts, 0)):
+            paths.unfolded[i] = is_unfolded(surface, paths, i, floor)
 
 
 @ti.func

@@ -216,7 +216,9 @@ def _write_triangle_passages(
             checked = g.exempt[s.body[a] * s.n_bodies + s.body[b]] == 0
         elif e < n_near + n_adjacent:
             kind, a = ADJACENT, part_first(c, g.n_adjacent, s.chunks) + e - n_near
-            checked = g.exempt[_body_of(s, g.adjacent[a, 0]) * (s.n_bodies + 1)] == 0
+            checked = g.unfolded[g.adjacent[a, 6]] == 0
+            if checked:
+                checked = g.exempt[_body_of(s, g.adjacent[a, 0]) * (s.n_bodies + 1)] == 0
         elif ti.static(o.has_round):
             kind, a = ROUND, part_first(c, s.n_triangles, s.chunks) + (e - n_near - n_adjacent) % n_triangles
             b = (e - n_near - n_adjacent) // n_triangles

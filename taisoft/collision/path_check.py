@@ -51,7 +51,8 @@ NO_PASSAGES = HeldPassages.at_start(np.zeros((0, 4), dtype=np.int32))
 
 def adjacent_rows(triangle: np.ndarray) -> np.ndarray:
     """Return the vertices (k,6) of what must not pass each other among triangles (n,3) with common vertices: the edge of one
-    opposite the common vertex and the other; if an edge is common, the opposite corners and the sides between them."""
+    opposite the common vertex and the other; if an edge is common, the opposite corners and the sides between them. Then (k,7)
+    with a common vertex."""
     t = np.asarray(triangle, dtype=np.int64)
     corner_of = t.reshape(-1)
     order = np.argsort(corner_of, kind="stable")
@@ -63,16 +64,14 @@ def adjacent_rows(triangle: np.ndarray) -> np.ndarray:
     n_common = common.sum(axis=1)
     one, k = n_common == 1, first % 3
     opposite = np.stack([t[a, (k + 1) % 3], t[a, (k + 2) % 3], t[a, (k + 2) % 3]], axis=1)
-    rows = [np.concatenate([opposite, t[b]], axis=1)[one]]
+    rows = [np.column_stack([opposite, t[b], corner_of[first]])[one]]
     both = (n_common == 2) & (a < b) & (first % 3 == common.argmax(axis=1))
     a, b, shared = a[both], b[both], common[both]
     p, q = t[a][np.arange(len(a)), shared.argmax(axis=1)], t[a][np.arange(len(a)), 2 - shared[:, ::-1].argmax(axis=1)]
     c = t[a][np.arange(len(a)), (~shared).argmax(axis=1)]
     d = np.where((t[b] != p[:, None]) & (t[b] != q[:, None]), t[b], -1).max(axis=1)
-    rows += [
-        np.stack(columns, axis=1) for columns in ((c, c, c, p, q, d), (d, d, d, p, q, c), (p, c, c, q, d, d), (q, c, c, p, d, d))
-    ]
-    return np.concatenate(rows)
+    sides = (c, c, c, p, q, d), (d, d, d, p, q, c), (p, c, c, q, d, d), (q, c, c, p, d, d)
+    return np.concatenate([*rows, *(np.stack([*columns, p], axis=1) for columns in sides)])
 
 
 class PathCheck:
@@ -106,12 +105,12 @@ class PathCheck:
             lo=arena.vectors("path_lo", ti.f64, triangle_ends, np.full((triangle_ends, 3), np.inf)),
             **{name: arena.field(f"path_{name}", ti.f64, triangle_ends) for name in ("low", "high")},
             has_pairs=has_pairs,
-            can_touch=arena.field("path_can_touch", ti.i32, n),
+            **{name: arena.field(f"path_{name}", ti.i32, n) for name in ("can_touch", "unfolded")},
             left=arena.field("path_left", ti.i32, 2),
             plane=arena.field("path_plane", ti.i32, max(HINTS * n_listed, 1)),
             exempt=arena.field("path_exempt", ti.i32, s.n_bodies**2),
             first_vertex=integers(arena, "path_first_vertex", topology.vertex_first),
-            adjacent=integers(arena, "path_adjacent", rows.reshape(-1, 6)),
+            adjacent=integers(arena, "path_adjacent", rows),
             n_adjacent=len(rows),
         )
         limits = capacity or (4 * n_listed + 64 if has_pairs else 1), max_capacity
@@ -147,7 +146,7 @@ class PathCheck:
         sides = np.full((len(passages), 2, 3), -1)
         near, adjacent, of_triangle = kind == NEAR, kind == ADJACENT, (kind == NEAR) | (kind == ROUND)
         sides[of_triangle, 0], sides[near, 1] = t[a[of_triangle]], t[b[near]]
-        sides[adjacent] = self._rows[a[adjacent]].reshape(-1, 2, 3)
+        sides[adjacent] = self._rows[a[adjacent], :6].reshape(-1, 2, 3)
         sides[kind == FLAT, 0] = a[kind == FLAT, None]
         row, is_edge = np.arange(len(f)), f >= 6
         for side, edge in enumerate(((f - 6) // 3, (f - 6) % 3)):

@@ -112,10 +112,8 @@ def _moving_plane_separates(a0, b0, c0, e0, f0, a1, b1, c1, e1, f1, need):
 def _any_moving_plane_separates(x, p, need, are_edges):
     """Whether the plane of one of the triangles, moving with it, stays at least `need` [m] from all corners of the other; or, for
     two edges, the plane through one of them and parallel to the other from that one."""
-    found, side = False, 0
-    if are_edges:
-        side = 2
-    while side < 3 and not found:
+    found = False
+    for side in range(int(are_edges), 2):
         base, other = ti.select(side == 0, 3, 0), ti.select(side == 0, 0, 3)
         a, b, c = row_of(x, base), row_of(x, base + 1), row_of(x, base + 2)
         a1, b1, c1 = a + row_of(p, base), b + row_of(p, base + 1), c + row_of(p, base + 2)
@@ -125,10 +123,7 @@ def _any_moving_plane_separates(x, p, need, are_edges):
             f1 = f + row_of(p, 4) - row_of(p, 3)
         d, e, g = row_of(x, other), row_of(x, other + 1), row_of(x, other + 2)
         d1, e1, g1 = d + row_of(p, other) - a1, e + row_of(p, other + 1) - a1, g + row_of(p, other + 2) - a1
-        found = _moving_plane_separates(d - a, e - a, g - a, b - a, f, d1, e1, g1, b1 - a1, f1, need)
-        side += 1
-        if not are_edges and side == 2:
-            side = 3
+        found = found or _moving_plane_separates(d - a, e - a, g - a, b - a, f, d1, e1, g1, b1 - a1, f1, need)
     return found
 
 

@@ -1,7 +1,8 @@
 """What the search rejects early never has a contact, and most other pairs are rejected:
 
 * a triangle for a vertex, on two wavy sheets that cross here and there and on one that is rolled up;
-* an edge for an edge, there too.
+* an edge for an edge, there too;
+* what must not pass each other around a vertex, on random fans of triangles and on a rolled-up sheet.
 """
 
 import numpy as np
@@ -12,8 +13,11 @@ from taisoft.backend.runtime import kernel
 from taisoft.collision.contacts import contact_fields
 from taisoft.collision.edge_edge import edge_contact, possible_crossings
 from taisoft.collision.features import mark_sharp_edges, moved
+from taisoft.collision.near_list import is_unfolded
+from taisoft.collision.passages import corners
+from taisoft.collision.separation import free_until
 from taisoft.collision.vertex_face import BESIDE, INSIDE, OUTSIDE, classify, may_have_contact
-from tests.collision.checked_paths import waves
+from tests.collision.checked_paths import FLOOR, checked, turned, waves
 from tests.collision.surfaces import place, sheet, surface_of
 
 MARGIN = 0.03
@@ -39,6 +43,18 @@ def judge_edges(s: ti.template(), pairs: ti.types.ndarray(), margin: ti.f64, fou
         out[k, 0], out[k, 1] = possible_crossings(s, t, k1, u, k2, margin), 0
         for at_end in range(2):
             out[k, 1] |= edge_contact(s, t, k1, u, k2, 1 << at_end, margin, found, 0, 0) << at_end
+
+
+@kernel(cse=False)
+def judge_rows(s: ti.template(), g: ti.template(), floor: ti.f64, are_apart: ti.i32, out: ti.types.ndarray()):
+    """out (k,2): whether the triangles around the common vertex of each row of `adjacent` count as unfolded; the part of the
+    motion until which that row is free."""
+    for r in range(g.n_adjacent):
+        x, p = corners(0.0), corners(0.0)
+        for k, q in ti.static(ti.ndrange(6, 3)):
+            x[k, q], p[k, q] = s.x[g.adjacent[r, k]][q], g.path[g.adjacent[r, k]][q]
+        time, _ = free_until(x, p, 0.0, floor, are_apart)
+        out[r, 0], out[r, 1] = is_unfolded(s, g, g.adjacent[r, 6], floor), time
 
 
 def two_sheets(rng) -> np.ndarray:
@@ -83,3 +99,36 @@ def test_what_is_rejected_has_no_contact(make, parts):
                     n_accepted[k] += (out[:, 0] > 0).sum()
                 n_all += len(vertices)
     assert n_found.min() > 50 and (n_accepted < np.array([0.5, 0.05]) * n_all).all()
+
+
+def fan(n: int) -> np.ndarray:
+    """Triangles of vertex 0 with n others around it."""
+    around = 1 + np.arange(n)
+    return np.stack([np.zeros(n, dtype=int), around, np.roll(around, -1)], axis=1)
+
+
+def spread(n: int, rng) -> np.ndarray:
+    """Places of its vertices: once or twice around the first one, flat, as a cone, or in a zigzag."""
+    turn = 2.0 * np.pi * rng.choice([1, 1, 1, 2]) * np.cumsum(rng.dirichlet(np.full(n, rng.choice([2.0, 20.0]))))
+    height = rng.choice([0.0, 0.1, 0.5, 2.0]) * (rng.standard_normal(n) + rng.choice([0.0, 2.0]))
+    around = np.stack([np.cos(turn), height, -np.sin(turn)], axis=1) * rng.uniform(0.3, 1.0, (n, 1))
+    return turned(np.concatenate([np.zeros((1, 3)), around]), rng, 3.0) + rng.uniform(-3.0, 3.0, 3)
+
+
+@pytest.mark.parametrize("name", ["fans", "roll"])
+def test_nothing_passes_around_an_unfolded_vertex(name):
+    sizes, rng, n_unfolded, n_passing, n_all = [3, 4, 5, 6, 7, 8] * 5, np.random.default_rng(6), 0, 0, 0
+    parts = [sheet(8)] if name == "roll" else [(spread(n, rng), fan(n)[k % 3 // 2 :]) for k, n in enumerate(sizes)]  # some open
+    with checked(parts) as one:
+        s, g = one.made.surface, one.check.fields
+        out = np.zeros((g.n_adjacent, 2))
+        for size in (0.0, 1e-3, 0.01, 0.03, 0.1, 0.3, 1.0):
+            for _ in range(6):
+                x = roll(rng) if name == "roll" else np.concatenate([spread(n, rng) for n in sizes])
+                move = waves(x, rng, size) + (0.1 if name == "roll" else 0.5) * size * rng.standard_normal(x.shape)
+                one.search(x, move)
+                g.path.from_numpy(move)
+                judge_rows(s, g, FLOOR, int(size > 0.0), out)
+                assert not ((out[:, 0] == 1.0) & (out[:, 1] < 1.0)).any()
+                n_unfolded, n_passing, n_all = n_unfolded + out[:, 0].sum(), n_passing + (out[:, 1] < 1.0).sum(), n_all + len(out)
+    assert n_unfolded > 0.1 * n_all and n_passing > 0.01 * n_all

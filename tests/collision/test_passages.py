@@ -27,7 +27,7 @@ from benchmarks.judge import axis_distance  # noqa: E402
 
 def test_rows_of_adjacent_triangles():
     """Of two triangles with a common vertex each one's opposite edge and the other one; with a common edge, the opposite corners
-    and the sides between them."""
+    and the sides between them. The last one given has triangles with all others."""
     book, box = np.array([[0, 1, k] for k in range(2, 6)]), ts.box_mesh((2, 1, 1), (1.0, 1.0, 1.0)).surface
     for faces in (sheet(3)[1], book, box, np.arange(9).reshape(3, 3)):
         t, expected = [frozenset(row) for row in faces.tolist()], []
@@ -39,8 +39,9 @@ def test_rows_of_adjacent_triangles():
                 r, s = (frozenset((v,)) for v in common)
                 expected += [{p, q | common}, {q, p | common}, {p | r, q | s}, {p | s, q | r}]
         rows = adjacent_rows(np.sort(faces, axis=1)).tolist()
-        found = [frozenset((frozenset(row[:3]), frozenset(row[3:]))) for row in rows]
+        found = [frozenset((frozenset(row[:3]), frozenset(row[3:6]))) for row in rows]
         assert Counter(found) == Counter(map(frozenset, expected))
+        assert all(set(row) <= frozenset().union(*(f for f in t if row[6] in f)) for row in rows)
 
 
 def two_sheets(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
