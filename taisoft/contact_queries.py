@@ -27,7 +27,7 @@ def touches(self: "Simulator") -> bool:
 def contact_limit(self: "Simulator", a: str, b: str) -> float:
     """Penetration [m] of colliders a and b above which a step counts as deep. Requires contact forces (`touches`)."""
     names = [c.name for c in self.scene.colliders]
-    return self._host().contact.measures.deep_from(names.index(a), names.index(b))
+    return self._host().contact.search.measures.deep_from(names.index(a), names.index(b))
 
 
 def contact_offset(self: "Simulator") -> float:
@@ -120,7 +120,7 @@ def pairs_in_contact(self: "Simulator") -> list[tuple[str, str]]:
 
 
 def _mean_contact(sim: "Simulator", what: str, name: str, other: str | None) -> np.ndarray:
-    """Return `ContactStep.mean_on` a collider, 0 without contacts. Raises SceneError for invalid names."""
+    """Return `ContactRecord.mean_on` a collider, 0 without contacts. Raises SceneError for invalid names."""
     contact, scene = sim._open().contact, sim.scene
     for one in (name, other):
         if one is not None:

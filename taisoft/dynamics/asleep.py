@@ -27,7 +27,7 @@ class AsleepContacts:
         self.rows, self.sides = rows, sides
 
     def __len__(self) -> int:
-        return len(self.rows["gap"])
+        return len(self.rows.get("gap", ()))
 
     @classmethod
     def taken(cls, rows: Rows, sides: Sides | None, chosen: np.ndarray, time: float) -> "AsleepContacts":
@@ -42,9 +42,9 @@ class AsleepContacts:
         sides = (self.sides and tuple(side[which] for side in self.sides) for which in both)
         return tuple(AsleepContacts(select(self.rows, which), own) for which, own in zip(both, sides))
 
-    def joined(self, other: "AsleepContacts | None") -> "AsleepContacts":
+    def joined(self, other: "AsleepContacts") -> "AsleepContacts":
         """Return these contacts and others."""
-        if other is None:
+        if not other:
             return self
         return AsleepContacts(join(self.rows, other.rows), self.sides and join_sides(self.sides, other.sides))
 
@@ -53,9 +53,12 @@ class AsleepContacts:
         return self.rows | {"r": time * self.rows["r"]}
 
     def contacts(self, time: float, own: bool) -> ContactRows:
-        """Return the contacts as `read_contacts`, with the impulses of a time [s]. own: with `sides`, if there are any."""
+        """Return the contacts as `rows_of`, with the impulses of a time [s]. own: with `sides`, if there are any."""
         return rows_of(self.after(time), 1.0, self.sides if own else None)
 
     def pairs(self, time: float, x: np.ndarray) -> Pairs:
         """Return the sums of `sum_pairs` in a time [s]. x: (n_nodes, 3) [m]."""
         return sum_pairs(self.contacts(time, own=True), np.zeros((len(self), 3)), x, None)
+
+
+NONE_ASLEEP = AsleepContacts({}, None)

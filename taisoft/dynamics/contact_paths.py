@@ -12,13 +12,13 @@ from scipy.sparse.csgraph import connected_components
 
 from taisoft.backend.arrays import FieldArena, download
 from taisoft.collision.contacts import FACE_FACE
-from taisoft.collision.detector import Detection
 from taisoft.collision.near_list import SEARCHED, TO_STATE
 from taisoft.collision.passages import FLAT, N_FEATURES, N_KINDS
 from taisoft.collision.path_check import NO_PASSAGES, HeldPassages
-from taisoft.contact.problem import ContactProblem
 from taisoft.dynamics.contact_measures import find_displacement
-from taisoft.dynamics.simulation_state import SimulationState
+from taisoft.dynamics.contact_record import ContactRecord
+from taisoft.dynamics.contact_search import ContactSearch
+from taisoft.dynamics.state import StepState
 from taisoft.errors import SimulationError
 from taisoft.fem.state import DEVIATION
 from taisoft.scene.connections import attached_pairs
@@ -31,8 +31,9 @@ class ContactPaths:
     SHORTENED = 0.9  # of the part of a path that is certainly free: how far bodies that are held back move
     MAX_SHORTENINGS, LEAST = 30, 1e-6  # rounds, and part of a path: beyond these, they do not move at all
 
-    def __init__(self, simulation: SimulationState, detection: Detection, arena: FieldArena):
-        self._simulation, self._detection = simulation, detection
+    def __init__(self, record: ContactRecord, search: ContactSearch, arena: FieldArena):
+        simulation, detection = record.simulation, search.detection
+        self._record, self._search, self._simulation, self._detection = record, search, simulation, detection
         self.uncovered = False  # whether the paths of the last check left what was searched
         self.held_back = ""  # a sentence about the last step, if bodies were held back,
         self._names: set[str] = set()  # and their names
@@ -43,7 +44,7 @@ class ContactPaths:
         n, group = connected_components(attached_pairs(detection.scene)[:n_bodies, :n_bodies])
         self._attached = [np.flatnonzero(group == k) for k in range(n) if (group == k).sum() > 1]  # move as one if held back
         detection.prepare_paths()
-        self.displacement = arena.vectors("path", ti.f64, simulation.model.n_nodes)  # of `left_searched` [m]
+        self.displacement = arena.vectors("path", ti.f64, simulation.model.n_nodes)  # of `keep_path` [m]
 
     def forget(self) -> None:
         """Discard all lists, after a state was set."""
@@ -69,11 +70,6 @@ class ContactPaths:
         """Begin a part of a step."""
         self._held, self._n_unchanged, self.has_found = self._simulation.now.held, 0, False
 
-    def left_searched(self, x_start) -> bool:
-        """Return whether the surface left the searched path since x_start; keep its displacement for another search."""
-        self.keep_path(x_start)
-        return self.leaves(self._simulation.model.state.scalars[DEVIATION])
-
     def leaves(self, deviation: float) -> bool:
         """Return whether a path so far from the searched one [m] leaves it."""
         return deviation > 0.5 * self._detection.margin
@@ -83,12 +79,12 @@ class ContactPaths:
         find_displacement(self._simulation.model, self._detection.surface, x_start, self.displacement)
 
     def find_unless_left(self, x_start) -> tuple[bool, bool]:
-        """Return whether the surface left the searched path since x_start, see `left_searched`, and else what `find` returns."""
+        """Return whether the surface left the searched path since x_start, and else what `find` returns; as `keep_path`."""
         model, paths = self._simulation.model, self._detection.paths
-        if model.on_cpu:
-            has_left = self.left_searched(x_start)
-            return has_left, not has_left and self.find()
         self.keep_path(x_start)
+        if model.on_cpu:
+            has_left = self.leaves(model.state.scalars[DEVIATION])
+            return has_left, not has_left and self.find()
         found = self._detection.passages(TO_STATE, [model.state.scalars])  # one reading for both
         has_left = self.leaves(paths.also[0][DEVIATION])
         return has_left, not has_left and self._hold_found(self._unless_bent(found, TO_STATE))
@@ -128,14 +124,25 @@ class ContactPaths:
         again = np.isfinite(earliest)
         self._held = HeldPassages(every[first], np.where(again, earliest, time[first]))
 
-    def use_all(self) -> None:
-        """Let the next search add all passages held, at their times along the searched paths."""
+    def search_along(self, time: float, dt: float) -> None:
+        """Search along `displacement` from the present state, with all passages held, at their times along the searched paths."""
         self._simulation.now.held = self._held
+        self._search.discard()
+        self._search.find_anew(time, dt, path=self.displacement)
 
-    def use_active(self, problem: ContactProblem) -> None:
-        """Let the next search add those that carry an impulse, at its positions."""
+    def search_way(self, time: float, dt: float, start: StepState) -> None:
+        """Search the way from a start to the present state, which stays."""
+        self.keep_path(start.x)
+        end = self._simulation.state()
+        self._simulation.now.copy_nodes_from(start)
+        self.search_along(time, dt)
+        self._simulation.set_state(*end)
+
+    def use_active(self) -> None:
+        """Let the next search add the passages held that carry an impulse, at its positions."""
         if len(self._held.pairs) == 0:
             return
+        problem = self._record.problem
         feature, impulse = download([problem.feature, problem.r], problem.count[0])
         active = feature[(feature[:, 0] == FACE_FACE) & (impulse[:, 0] > 0.0)]
         one, other = active[:, 1], active[:, 2]
@@ -146,6 +153,8 @@ class ContactPaths:
     def exempt_crossing(self) -> None:
         """Exempt the colliders that cross at the last search, and no others."""
         self._simulation.now.none_cross = not self._detection.exempt_crossing()
+        if self.none_cross:
+            self._search.discard()  # other contacts are found there
 
     def hold_back(self, x_start) -> bool:
         """Shorten the paths of bodies from x_start to the present state until nothing passes through anything; return whether any

@@ -168,9 +168,9 @@ class Dynamics:
         report.min_volume_ratio = min(result.min_volume_ratio, lowest)
         report.n_inverted = max(result.n_inverted, inverted)
         if (contact := self.contact) is not None:
-            report.n_contacts, report.max_penetration = contact.n_contacts + contact.n_asleep, contact.penetration
-            report.dropped_contacts, report.deep = contact.dropped, int(contact.is_deep)
-            report.crossings = contact.last_crossing.n_pairs
+            report.n_contacts, report.max_penetration = contact.n_contacts + len(contact.asleep), contact.check.penetration
+            report.dropped_contacts, report.deep = contact.dropped, int(contact.check.is_deep)
+            report.crossings = contact.check.last_crossing.n_pairs
             report.misplaced, report.contact_error = contact.misplaced.part, contact.misplaced.text
         return report
 
@@ -185,7 +185,7 @@ class Dynamics:
                 + (f", {report.crossings} pairs of surface triangles cross" if report.crossings else "")
             )
             names = [f"'{c.name}'" for c in self.scene.colliders]
-            overlaps = self.contact.last_crossing.inside
+            overlaps = self.contact.check.last_crossing.inside
             owners = (f"{names[a]} and {names[b]}" if a != b else f"parts of {names[a]}" for a, b, _ in overlaps)
             found += [f"{owner} overlap by {depth:.3g} m" for owner, (*_, depth) in zip(owners, overlaps)]
         if report.contact_error:
@@ -240,7 +240,7 @@ class Dynamics:
             self.commands.follow(mover, command)
         self.changes += 1
         if self.contact is not None:
-            self.contact.motion_changed()
+            self.contact.search.discard()
 
     def command_poses(self, poses: dict[str, Pose]) -> None:
         """Let obstacles, by name, move to poses in the next step."""
@@ -327,7 +327,7 @@ class Dynamics:
         """Detect the contacts of the present state swept by dt [s]; with 0, paths are evaluated at the present time only."""
         state = self.state
         if self.contact is not None:
-            self.contact.search_all(state.time, dt)
+            self.contact.search.find_all(state.time, dt)
             return self.contact.detection
         if self._idle_detection is None:
             from taisoft.collision.detector import Detection

@@ -149,20 +149,20 @@ class Batch:
     def suits(self) -> bool:
         """Return whether the next sub-steps may be a batch."""
         simulation, contact = self._simulation, self._contact
-        is_free = simulation.now.none_cross and not len(simulation.now.held.pairs) and not contact.has_paths
+        is_free = simulation.now.none_cross and not len(simulation.now.held.pairs) and not simulation.has_paths
         return self._suits and is_free and not simulation.loads.vary and contact.n_contacts <= MOST_OF_TEAM
 
-    @property
-    def asks_for_far(self) -> bool:
-        """Whether sub-steps in which nothing can touch are taken without a search: on the GPU path a batch with searches reads
-        less."""
-        return self._simulation.model.on_cpu or self._keeps or not self.suits()
+    def is_far(self, time: float, dt: float) -> bool:
+        """Return whether nothing can touch in a sub-step of dt from a time, if that is to be asked: on the GPU path a batch with
+        searches reads less."""
+        asks = self._simulation.model.on_cpu or self._keeps or not self.suits()
+        return asks and self._contact.search.is_far(time, dt, self._contact.n_contacts)
 
     def search(self, n: int, time: float, dt: float) -> int:
         """Search, unless it is known what is near, and return how many of n sub-steps of dt [s] from a time a batch can take."""
         if self._keeps:
-            return self._contact.keep(time, dt, n)
-        self._contact.search(time, dt)
+            return self._contact.search.keep(time, dt, n)
+        self._contact.search.find(time, dt)
         return n
 
     def run(self, n: int, time: float, dt: float, good: StepState, max_sweeps: int) -> None:
@@ -170,22 +170,25 @@ class Batch:
 
         good: the state at the start, which becomes that after the last sub-step accepted. The tally is right after Ctrl-C, too.
         """
-        contact, detection = self._contact, self._contact.detection
+        contact, search, detection = self._contact, self._contact.search, self._contact.detection
         self.tally, self.event = np.zeros(N_TALLY), NOTHING
-        contact.begin_batch()
+        contact.make_room()
         begin_tally(detection.surface, self._tally, detection.counts.found, detection.counts.contacts)
         try:
             for k in range(n):
                 self.launch(k, time + k * dt, dt, good, max_sweeps)
         finally:
             interrupt = self._read(n)
-            done, counts = int(self.tally[DONE]), [int(self.tally[k]) for k in (CONTACTS, FOUND_BEFORE, FOUND_LAST, KEPT_LAST)]
-            contact.far.skip(done - int(self.event == NOTHING and not self._keeps))
+            done, n, before, found, kept = self.tally[[DONE, CONTACTS, FOUND_BEFORE, FOUND_LAST, KEPT_LAST]].astype(int).tolist()
+            is_whole = self.event in (NOTHING, OUTDATED)  # the next sub-step has not begun
+            search.far.skip(done - int(self.event == NOTHING and not self._keeps))
             if self._keeps:
-                is_whole = self.event in (NOTHING, OUTDATED)
-                contact.end_kept(dt, counts[0] if is_whole else None, done, self.event == OUTDATED)
+                search.count_done(done, self.event == OUTDATED)
+                contact.take_over(dt, n if is_whole else None, detection.counts.found, detection.counts.unmapped)
             else:
-                contact.end_batch(time + done * dt, dt, *counts, self.event == NOTHING)
+                search.adopt(time + done * dt, dt, found, kept)
+                contact.take_over(dt, *((n, before) if is_whole else (kept, found)))
+            contact.check.measure_crossings()
         if interrupt is not None:
             raise interrupt
 
@@ -206,7 +209,7 @@ class Batch:
         model, contact, work, detection = self._simulation.model, self._contact, self._work, self._contact.detection
         p, s, search = contact.problem, detection.surface, (detection.surface, detection.shapes)
         warm, offset, n = contact.warm_factor(dt) if k == 0 else 1.0, contact.contact_offset, detection.counts.contacts
-        if self._keeps and contact.ahead.done + k > 0:
+        if self._keeps and contact.search.done + k > 0:
             carry_on(p, model, s, dt, offset)
         else:
             fill(p, model, *search, contact.numbers, detection.buffer.data, detection.reduction, -1, dt, warm, offset, 1)
@@ -220,7 +223,7 @@ class Batch:
         if not self._keeps:
             room = min(p.capacity - 1, p.node.shape[0] // (NODES * model.most_masters))
             detection.search_shapes(detection.motion(time + dt, dt), True, room, NOT_FOUND)
-        state, kept = (good.x, good.v, good.slip, self._simulation.now.slip), (self._keeps, contact.ahead.x, self._slack)
+        state, kept = (good.x, good.v, good.slip, self._simulation.now.slip), (self._keeps, contact.search.x, self._slack)
         accept(model, p, s, detection.buffer.data, detection.reduction, *state, self._tally, dt, self._tolerance, *kept)
 
     @property

@@ -7,7 +7,7 @@ import numpy as np
 from taisoft.contact.build import end_contacts
 from taisoft.contact.colouring import colour_contacts
 from taisoft.contact.solve import SolveResult, solve, sweeps_per_launch, team_of
-from taisoft.dynamics.contact import BLOCKED, FREE, MAX_PASSAGES, TOLERANCE, ContactStep
+from taisoft.dynamics.contact import TOLERANCE, ContactStep
 from taisoft.dynamics.explicit_batch import (
     ALL_SWEEPS,
     DEEPEST,
@@ -28,6 +28,7 @@ from taisoft.dynamics.explicit_batch import (
 )
 from taisoft.dynamics.explicit_contact import begin_solve, finish_verlet, move, predict
 from taisoft.dynamics.explicit_stepper import ExplicitStepper
+from taisoft.dynamics.part_check import BLOCKED, FREE, MAX_PASSAGES
 from taisoft.dynamics.results import StepResult
 from taisoft.dynamics.rigid_contacts import RigidContacts
 from taisoft.dynamics.search_ahead import MOST as SEARCHED_ONCE
@@ -76,7 +77,7 @@ class ContactExplicitStepper(ExplicitStepper):
         """
         simulation, model, tally, done = self.simulation, self.simulation.model, np.zeros(N_TALLY), 0
         begin_advance(model, self.contact.detection.surface)
-        n, start = min(n, self.max_batch), simulation.time
+        n, start, check = min(n, self.max_batch), simulation.time, self.contact.check
         self.good.copy_from(simulation.now)
         releases, targets = simulation.releases, None
         if self.work.n_prescribed:
@@ -89,7 +90,7 @@ class ContactExplicitStepper(ExplicitStepper):
             while done < n:
                 if targets is not None:
                     self._upload_targets(targets[done : done + 1])
-                event, is_far = NOTHING, self.batch.asks_for_far and self.contact.is_far(start + done * dt, dt)
+                event, is_far = NOTHING, self.batch.is_far(start + done * dt, dt)
                 if not is_far and self.batch.suits():
                     event = self._take_batch(min(n - done, MOST), start + done * dt, dt, tally)
                     done = int(tally[DONE])
@@ -100,9 +101,10 @@ class ContactExplicitStepper(ExplicitStepper):
                     tally[ALL_SWEEPS] += result.iterations
                     tally[UNSOLVED] += not result.converged
                     tally[WORST] = max(tally[WORST], result.residual)
-                self._deepen(tally, self.contact.end(start + (done + 1) * dt, dt), self.contact.relative_penetration)
+                check.end(start + (done + 1) * dt, dt)
+                self._deepen(tally, check.penetration, check.relative_penetration)
                 if done + 1 == n:  # once per batch: it costs about as much as a search
-                    self._deepen(tally, *self.contact.measure_crossings())
+                    self._deepen(tally, *check.measure_crossings())
                 done += 1
                 tally[DONE] = done
                 self.contact.end_substep(self.good.x)
@@ -115,7 +117,7 @@ class ContactExplicitStepper(ExplicitStepper):
             simulation.step_count += done
             simulation.time = start + done * dt
             raise
-        self.contact.penetration, self.contact.relative_penetration = map(float, tally[[DEEPEST, DEEPEST_RELATIVE]])
+        check.penetration, check.relative_penetration = map(float, tally[[DEEPEST, DEEPEST_RELATIVE]])
         lowest, most_inverted = model.state.scalars.to_numpy()[[LOWEST_J, MOST_INVERTED]].tolist()
         result = StepResult(
             steps=n,
@@ -184,16 +186,16 @@ class ContactExplicitStepper(ExplicitStepper):
         """
         simulation, contact, good = self.simulation, self.contact, self.good
         if not is_far and event == NOTHING:
-            contact.search(time, dt)
-        if not contact.paths.none_cross and contact.measures.closing_ratio > 1.0:
-            raise SimulationError(f"step {step}: {contact.measures.describe_fast_closing(dt)}")
+            contact.search.find(time, dt)
+        if not contact.paths.none_cross and contact.search.measures.closing_ratio > 1.0:
+            raise SimulationError(f"step {step}: {contact.search.measures.describe_fast_closing(dt)}")
         contact.start_substep(dt)
         for tries in range(MAX_PASSAGES + 1):
             result = self._solve_and_move(step, time, dt, is_far, event)
-            if event == NOT_FOUND or (is_far and contact.far.stays()):
+            if event == NOT_FOUND or (is_far and contact.search.far.stays()):
                 break
             is_far, event = False, NOTHING
-            way = contact.certify(time, dt, good)
+            way = contact.check.certify(time, dt, good)
             if way == FREE:
                 break
             self.acceleration_stale = True
@@ -204,7 +206,7 @@ class ContactExplicitStepper(ExplicitStepper):
             simulation.now.copy_nodes_from(good)
             simulation.now.copy_history_from(good)
             simulation.begin_branches(0.0)
-            contact.search_along(time, dt)
+            contact.paths.search_along(time, dt)
         return result
 
     def _move_branches(self, dt: float) -> None:
@@ -218,11 +220,12 @@ class ContactExplicitStepper(ExplicitStepper):
         model, work, contact = self.simulation.model, self.work, self.contact
         if event < NOT_SOLVED:
             self._prepare(time)
-            n = 0 if is_far else contact.begin(time, dt)
+            if is_far:
+                contact.take_over(dt, 0, 0)
+            else:
+                contact.begin(time, dt)
             predict(model, work, contact.problem, contact.detection.surface, dt, *contact.gap_targets)
-        else:
-            n = contact.n_contacts
-        result = self._solve(n, event) if n else None
+        result = self._solve(contact.n_contacts, event) if contact.n_contacts else None
         if event < FAULT:
             surface = contact.detection.surface
             move(model, work, contact.problem, surface, dt, NOTHING)

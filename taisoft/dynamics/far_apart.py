@@ -36,25 +36,21 @@ def find_deviation(m: ti.template(), s: ti.template()):
 
 
 class FarApart:
-    """Searches for many sub-steps, and how long what they say holds."""
+    """Searches for many sub-steps. until [s]: how long it is known that nothing can touch; 0: it is not."""
 
     def __init__(self, simulation: SimulationState, detection: Detection):
         self._simulation, self._detection = simulation, detection
         self._limit = (MAX_DEVIATION * detection.reach) ** 2  # [m^2]
-        self._until, self._length, self._pause = 0.0, MOST, 0
+        self.until, self._length, self._pause = 0.0, MOST, 0
 
     def forget(self) -> None:
         """Discard what is known, after another search or a change of the state."""
-        self._until = 0.0
+        self.until = 0.0
 
     @property
     def is_known(self) -> bool:
         """Whether nothing touches at the end of the last sub-step."""
-        return self._until > 0.0
-
-    def covers(self, end: float) -> bool:
-        """Return whether it is known that nothing can touch until a time [s]."""
-        return end <= self._until
+        return self.until > 0.0
 
     def is_due(self) -> bool:
         """Return whether to search now. Called once a sub-step."""
@@ -69,18 +65,18 @@ class FarApart:
         """Search from a time [s] for as many sub-steps of dt as nothing can touch in. finds_nothing: searches for so many."""
         while self._length >= FEWEST:
             if finds_nothing(time, dt, self._length):
-                self._until, self._length = time + (self._length + 0.5) * dt, MOST
+                self.until, self._length = time + (self._length + 0.5) * dt, MOST
                 return
             self._length //= 4
         self._length, self._pause = MOST, PAUSE
 
     def snapshot(self) -> dict:
         """Return what is known for a checkpoint."""
-        return {"until": self._until, "length": self._length, "pause": self._pause}
+        return {"until": self.until, "length": self._length, "pause": self._pause}
 
     def restore(self, kept: dict) -> None:
         """Restore a `snapshot`; an empty one, that of a start."""
-        self._until = float(kept.get("until", 0.0))
+        self.until = float(kept.get("until", 0.0))
         self._length, self._pause = int(kept.get("length", MOST)), int(kept.get("pause", 0))
 
     def stays(self) -> bool:

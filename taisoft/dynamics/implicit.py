@@ -2,7 +2,7 @@
 
 A step is tried whole, or as long as the last parts that were kept allow (`part_length`). What the way of a part meets becomes a
 contact, with which its stage is solved on (`_attempt`). A part is rejected, undone and halved if its way is not free all the
-same (`ContactStep.certify`), or if Newton's method failed and shorter parts may help. What cannot be halved is kept and reported;
+same (`PartCheck.certify`), or if Newton's method failed and shorter parts may help. What cannot be halved is kept and reported;
 bodies that would still pass through something are held back. Where surfaces cross already, contacts that close fast limit the
 length, and motion too fast for the shortest part is refused.
 
@@ -17,9 +17,10 @@ from dataclasses import replace
 import numpy as np
 
 from taisoft.backend.arrays import download
-from taisoft.dynamics.contact import FREE, MAX_PASSAGES, MET, ContactStep
+from taisoft.dynamics.contact import ContactStep
 from taisoft.dynamics.implicit_stages import ImplicitStages
 from taisoft.dynamics.no_contacts import NoContacts
+from taisoft.dynamics.part_check import FREE, MAX_PASSAGES, MET
 from taisoft.dynamics.part_length import PARTS, PartLength
 from taisoft.dynamics.results import StageResult, StepResult, count_all, merge
 from taisoft.dynamics.simulation_state import SimulationState
@@ -112,7 +113,7 @@ class ImplicitStepper(ImplicitStages):
             self.simulation.return_to(self.first)
             self.n_previous = 0
             self._length.restore(length)
-            self.contact.discard_search(with_impulses=False)
+            self.contact.search.discard()
         self.last = merge(kept)
         return self._report(count_all(self.last, dropped), len(kept), held)
 
@@ -142,7 +143,7 @@ class ImplicitStepper(ImplicitStages):
         while left:
             now, is_rest = time + (1.0 - left / PARTS) * dt, self._is_spent()
             longest = left if self._is_over() else min(left, length.units(dt))
-            units = left if is_rest else contact.most_units(now, dt, longest)
+            units = left if is_rest else contact.check.most_units(now, dt, longest)
             part = units / PARTS * dt
             result = self._hold(now, part) if is_rest else self._attempt(now, part)
             # linearly implicit stages do not iterate: shorter ones need not converge sooner
@@ -190,7 +191,7 @@ class ImplicitStepper(ImplicitStages):
             self.n_previous = n_previous = min(n_previous, self.n_previous)
             if not math.isfinite(result.residual):
                 return count_all(result, results[:-1])
-            way = contact.certify(time, dt, self.start)
+            way = contact.check.certify(time, dt, self.start)
             is_hopeless = not (result.converged or self.scheme.one_iteration or self.scheme.c == 0.0)
             is_late = self.solver.budget.is_out_of_time()  # an iterate that has not converged may then be near
             n_late += is_late
@@ -201,7 +202,7 @@ class ImplicitStepper(ImplicitStages):
                 start = self.simulation.velocities()
             self.simulation.now.copy_nodes_from(self.start)
             self.n_previous = 0
-            contact.search_along(time, dt)
+            contact.paths.search_along(time, dt)
 
     def _refuse_runaway(self) -> None:
         """Raise SimulationError if a body has left, in a static part that did not converge."""
@@ -219,8 +220,9 @@ class ImplicitStepper(ImplicitStages):
         """Return to the start of the part, for a shorter one. discard_impulses: they would not help it."""
         self.simulation.return_to(self.start)
         self.n_previous = 0
-        # BDF2 detects impacts by the contacts without impulse in the last step
-        self.contact.discard_search(with_impulses=discard_impulses or self.scheme.before > 0.0)
+        self.contact.search.discard()
+        if discard_impulses or self.scheme.before > 0.0:  # BDF2 detects impacts by the contacts without impulse in the last step
+            self.contact.discard_impulses()
 
     def _is_spent(self) -> bool:
         """Whether the step has no Newton iterations left."""
@@ -250,7 +252,7 @@ class ImplicitStepper(ImplicitStages):
         end = self.simulation.state()[0] if self.solver.budget.ran_out else None
         if not result.free:
             if not is_over:
-                self.contact.refuse_fast_closing(dt)
+                self.contact.check.refuse_fast_closing(dt)
             if paths.hold_back(self.start.x):
                 self.n_previous, result = 0, replace(result, converged=False)
         if not result.converged and is_over:

@@ -177,7 +177,7 @@ class ImplicitStages:
         v = self.solver.follow(v, dt)
         simulation.set_state(x + dt * v, v)
         v = simulation.velocities()
-        self.contact.search_way(time, dt, self.start)
+        self.contact.paths.search_way(time, dt, self.start)
         simulation.now.copy_nodes_from(self.start)
         return v
 

@@ -1,7 +1,7 @@
 """How long the next part of an implicit step is: the one place that decides about halving.
 
 The stepper asks nothing more once the Newton iterations of a step are used up, and where surfaces cross, contacts may allow less
-(`ContactStep.most_units`).
+(`PartCheck.most_units`).
 """
 
 import math

@@ -47,13 +47,9 @@ def offsets_of(common: float, within: np.ndarray, guard: np.ndarray) -> np.ndarr
     return common * np.where(within, SELF_CONTACT, 1.0) * np.where(guard, GUARD, 1.0)
 
 
-def read_contacts(problem: ContactProblem, impulse_fraction: float) -> ContactRows:
-    """Return a problem's contacts with their impulses. impulse_fraction: of a step, in which they act."""
-    return rows_of(read_rows(problem), impulse_fraction)
-
-
 def rows_of(rows: dict[str, np.ndarray], impulse_fraction: float, sides: tuple | None = None) -> ContactRows:
-    """Return what `read_rows` has read. sides: nodes and weights (k, 2 w) to be returned instead of those of the rows."""
+    """Return the contacts that `read_rows` has read. impulse_fraction: of a step, in which their impulses act; sides: nodes and
+    weights (k, 2 w) to be returned instead of those of the rows."""
     normal, tangent, r = rows["normal"], rows["tangent"], rows["r"] / impulse_fraction + rows["impact_impulse"]
     impulse = r[:, :1] * normal + r[:, 1:2] * tangent + r[:, 2:] * np.cross(normal, tangent)
     if sides is None:
@@ -144,7 +140,7 @@ def nodal_impulses(contacts: Contacts | ContactRows, n_nodes: int) -> np.ndarray
 
 
 def read_rows(problem: ContactProblem, names: list[str] = ROWS) -> dict[str, np.ndarray]:
-    """Return what a later step, or `read_contacts`, needs of a problem's contacts: fields by name, node and weight row by row.
+    """Return what a later step, or `rows_of`, needs of a problem's contacts: fields by name, node and weight row by row.
 
     names: MORE_ROWS for what this step needs.
     """

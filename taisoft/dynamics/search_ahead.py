@@ -12,12 +12,11 @@ All that the coming sub-steps depend on is kept in checkpoints. A search that a 
 this one.
 """
 
-from typing import Any
-
 import numpy as np
 import taichi as ti
 
 from taisoft.backend.arrays import FieldArena, download, upload
+from taisoft.dynamics.contact_search import ContactSearch
 from taisoft.dynamics.simulation_state import SimulationState
 from taisoft.dynamics.state import copy_nodes
 
@@ -25,53 +24,104 @@ MOST = 4  # sub-steps whose contacts are kept
 SLACK = 0.05  # of the finest body's mean surface edge: by how much their nodes may move
 
 
-class SearchAhead:
-    """Such a search. time [s]: of its state; dt [s], n: of the sub-steps that it may serve; done: those taken by batches."""
+class SearchAhead(ContactSearch):
+    """Searches of explicit steps. time [s]: of the state of the last one ahead; dt [s], n: of the sub-steps that it may serve;
+    done: those taken by batches."""
 
-    def __init__(self, simulation: SimulationState, arena: FieldArena):
-        self._simulation = simulation
+    drops_uncertain = False
+
+    def __init__(self, simulation: SimulationState, self_collision: bool, arena: FieldArena):
+        super().__init__(simulation, self_collision, arena)
         self.x, self._v = (arena.vectors(f"{array}_searched", ti.f64, simulation.model.n_nodes) for array in "xv")
         self.time, self.dt, self.n, self.done = 0.0, 0.0, 0, 0
 
-    def begin(self, time: float, dt: float, n: int) -> None:
-        """Take over a search that was made from the present state."""
-        now, self.time, self.dt, self.n, self.done = self._simulation.now, time, dt, n, 0
-        copy_nodes(self._simulation.model, self.x, self._v, now.x, now.v)
+    def discard(self) -> None:
+        """Let no search serve a step any more."""
+        super().discard()
+        self.discard_ahead()
 
-    def left(self, time: float, dt: float) -> int:
-        """Return how many sub-steps of dt from a time it may still serve."""
-        fits = dt == self.dt and abs(self.time + self.done * dt - time) <= 1e-6 * dt
-        return self.n - self.done if fits else 0
-
-    def forget(self) -> None:
-        """Discard it."""
+    def discard_ahead(self) -> None:
+        """Let no search serve several sub-steps any more."""
+        self.far.forget()
         self.n = self.done = 0
 
-    @property
-    def searched(self) -> tuple[float, float]:
-        """Time and length [s] of what was searched."""
-        return self.time, self.n * self.dt
-
-    def call_there(self, function: Any) -> None:
-        """Call a function in the state of the search, which it must not change."""
-        simulation, now = self._simulation, self._simulation.now
-        end = simulation.state()
-        copy_nodes(simulation.model, now.x, now.v, self.x, self._v)
-        try:
-            function()
-        finally:
-            upload(list(zip((now.x, now.v), end)))
-
     def snapshot(self) -> dict:
-        """Return it for a checkpoint; empty if there is none."""
-        if not self.n:
-            return {}
-        x, v = download([self.x, self._v])
-        return {"x": x, "v": v, "time": self.time, "dt": self.dt, "n": self.n, "done": self.done}
+        """Return what later searches depend on, with the state of one that serves several sub-steps."""
+        ahead = {}
+        if self.n:
+            x, v = download([self.x, self._v])
+            ahead = {"x": x, "v": v, "time": self.time, "dt": self.dt, "n": self.n, "done": self.done}
+        return super().snapshot() | {"ahead": ahead}
 
     def restore(self, kept: dict) -> None:
         """Restore a `snapshot`."""
-        self.n = self.done = 0
-        if kept:
-            upload([(self.x, np.asarray(kept["x"])), (self._v, np.asarray(kept["v"]))])
-            self.time, self.dt, self.n, self.done = float(kept["time"]), float(kept["dt"]), int(kept["n"]), int(kept["done"])
+        super().restore(kept)
+        if ahead := kept.get("ahead"):
+            upload([(self.x, np.asarray(ahead["x"])), (self._v, np.asarray(ahead["v"]))])
+            self.time, self.dt = float(ahead["time"]), float(ahead["dt"])
+            self.n, self.done = int(ahead["n"]), int(ahead["done"])
+
+    def keep(self, time: float, dt: float, n: int) -> int:
+        """Return how many of n sub-steps of dt from a time [s] are served by one search, after it was made."""
+        if self.n != MOST or not self._left(time, dt):
+            self.far.forget()
+            self._look_ahead(time, dt, MOST)
+        self._look_again()
+        self.detection.list_near()
+        return min(n, self._left(time, dt))
+
+    def count_done(self, n: int, is_outdated: bool) -> None:
+        """Count n sub-steps that kept the contacts. is_outdated: whether the next one needs another search."""
+        self.done += n
+        if is_outdated or self.done == self.n:
+            self.n = self.done = 0
+
+    def adopt(self, time: float, dt: float, found: int, kept: int) -> None:
+        """Take over a search at a time, swept by dt, that a batch has made: its contacts before the reduction and after it."""
+        self.detection.adopt(found, kept)
+        self.measures.begin(dt)
+        self.searched, self._is_near = (time, dt), found > 0
+
+    def is_far(self, time: float, dt: float, n_before: int) -> bool:
+        """Return whether nothing can touch in a sub-step of dt from a time, see `far_apart`: it needs no search. n_before:
+        contacts in the one before."""
+        far, simulation = self.far, self._simulation
+        if time + dt > far.until:
+            far.forget()
+            if self._left(time, dt) or n_before or self._is_near or not simulation.now.none_cross or simulation.has_paths:
+                return False
+            if not far.is_due():
+                return False
+            far.search(time, dt, self._look_ahead)
+        if far.is_known:
+            self._look_again()
+        return far.is_known
+
+    def _left(self, time: float, dt: float) -> int:
+        """Return how many sub-steps of dt from a time the last search ahead may still serve."""
+        fits = dt == self.dt and abs(self.time + self.done * dt - time) <= 1e-6 * dt
+        return self.n - self.done if fits else 0
+
+    def _look_ahead(self, time: float, dt: float, n: int) -> bool:
+        """Search for n sub-steps of dt from a time [s]; return whether nothing can touch in them."""
+        now, self.time, self.dt, self.n, self.done = self._simulation.now, time, dt, n, 0
+        copy_nodes(self._simulation.model, self.x, self._v, now.x, now.v)
+        self._search_ahead()
+        return not self._is_near
+
+    def _look_again(self) -> None:
+        """Repeat the search that serves several sub-steps, in its state, if a question has made another one since."""
+        if self.searched == (self.time, self.n * self.dt):
+            return
+        simulation, now, is_near = self._simulation, self._simulation.now, self._is_near
+        end = simulation.state()
+        copy_nodes(simulation.model, now.x, now.v, self.x, self._v)
+        try:
+            self._search_ahead()
+        finally:
+            upload(list(zip((now.x, now.v), end)))
+        self._is_near = is_near
+
+    def _search_ahead(self) -> None:
+        self.find_anew(self.time, self.n * self.dt)
+        self.detection.paths.forget()  # the list of near triangles holds as long as the search

@@ -75,6 +75,11 @@ class SimulationState:
         """The same at the nodes where they end, even if these depend on others."""
         return self.springs if self.dependents is None else spring_table(self.scene, None)
 
+    @property
+    def has_paths(self) -> bool:
+        """Whether motion is prescribed: the user may change it between two steps, and a path may end with the last one."""
+        return self.dirichlet.n_prescribed > 0 or not all(obstacle.rests(self.time) for obstacle in self.scene.obstacles)
+
     def state(self) -> tuple[np.ndarray, np.ndarray]:
         """Return positions and velocities of all nodes, in their stored precision."""
         x, v = download([self.model.state.x, self.model.state.v])

@@ -91,15 +91,15 @@ class Sleep:
             self._was_moving = moving
             self._tell_contacts()
         while moving.any() or not self.asleep[: self._n].all():
-            contact.search(time, dt)
-            if not self.wake(contact.touching(self.asleep)):
+            contact.search.find(time, dt)
+            if not self.wake(contact.search.touching(self.asleep)):
                 break
         return bool(self.asleep[: self._n].all())
 
     def see_part(self) -> None:
         """See what presses on sleeping bodies at the end of a part of a step, before the next one."""
         if not self._contact.idle and self.asleep.any():
-            self._pressed |= self.asleep if self._contact.paths.held_back else self._contact.touching(self.asleep, pressing=True)
+            self._pressed |= self.asleep if self._contact.paths.held_back else self._contact.pressing(self.asleep)
 
     def is_pressed(self) -> bool:
         """Wake what has been pressed in the step that was taken; return whether anything has, so that it must be taken again."""
@@ -170,7 +170,7 @@ class Sleep:
         """Search contacts only with what does not rest."""
         rests = self.asleep.copy()
         rests[self._n :] = rests.any() & ~self._was_moving[self._n :]
-        self._contact.let_rest(rests)
+        self._contact.search.let_rest(rests)
 
     # --- falling asleep and waking ------------------------------------------------------------------------------------
 

@@ -33,8 +33,7 @@ def refused(scene: ts.Scene, move) -> bool:
     """Whether displacements move(positions) of body b, with obstacles over a second, are refused."""
     with dynamics(scene, dt=1.0, precision="f64") as made:
         contact, x = made.contact, made.state.state()[0]
-        contact.search(0.0, 1.0)
-        contact.initial_crossing()
+        contact.start_step(0.0, 1.0)
         assert contact.paths.none_cross
         displacement = np.zeros_like(x)
         rows = made.state.layout.nodes(len(scene.bodies) - 1)

@@ -13,7 +13,7 @@ import pytest
 
 import taisoft as ts
 from taisoft.collision.contacts import Contacts
-from taisoft.dynamics.contact import BLOCKED, ContactStep
+from taisoft.dynamics.part_check import BLOCKED, PartCheck
 from taisoft.dynamics.schemes import EXPLICIT
 from taisoft.fem.reference import lumped_masses
 from taisoft.mesh.quality import mean_surface_edge
@@ -253,14 +253,14 @@ def test_contact_laws(sim):
 @by("implicit_euler", "velocity_verlet")
 def test_forces_of_pairs_add_up_to_those_of_bodies(sim, monkeypatch):
     """The load falls on the cube; the first implicit step is halved, as if its way were blocked."""
-    explicit, cut, whole, ways, certify = sim.settings.explicit, 0, 0, [], ContactStep.certify
+    explicit, cut, whole, ways, certify = sim.settings.explicit, 0, 0, [], PartCheck.certify
 
     def blocked_once(*given):
         ways.append(certify(*given))
         return BLOCKED if len(ways) == 1 else ways[-1]
 
     if not explicit:
-        monkeypatch.setattr(ContactStep, "certify", blocked_once)
+        monkeypatch.setattr(PartCheck, "certify", blocked_once)
     sim.dt = 0.001 if explicit else 0.002
     x = sim.positions("load") + (0.1 - 2.02, SIDE + 4e-4 - 0.5, 0.0)
     sim.set_state(x, np.tile([0.5, -3.0, 0.0], (len(x), 1)), body="load")

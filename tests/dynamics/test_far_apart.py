@@ -9,9 +9,9 @@ import pytest
 
 import taisoft as ts
 from taisoft.collision.detector import Detection
-from taisoft.dynamics import contact
-from taisoft.dynamics.contact import ContactStep
+from taisoft.dynamics import search_ahead
 from taisoft.dynamics.schemes import EXPLICIT
+from taisoft.dynamics.search_ahead import SearchAhead
 from tests.dynamics.contact_scenes import cube, ground, material
 
 STEPS, FALL = 300, 0.1  # of the lower cube [m]
@@ -50,12 +50,12 @@ def test_results_are_those_of_a_search_in_every_step(integrator, monkeypatch):
         return find(self, *args, **kwargs)
 
     monkeypatch.setattr(Detection, "find", count)
-    monkeypatch.setattr(contact, "MOST", 1)  # no contacts are kept, as searches ahead may find some earlier
+    monkeypatch.setattr(search_ahead, "MOST", 1)  # no contacts are kept, as searches ahead may find some earlier
     with ts.Simulator(scene(), 1e-3, integrator, precision="f64") as sim:
         seldom, n_seldom = fly(sim), len(searches)
         asked = fly(sim, asks=True)
         searches.clear()
-        monkeypatch.setattr(ContactStep, "is_far", lambda self, time, dt: False)
+        monkeypatch.setattr(SearchAhead, "is_far", lambda *_: False)
         every = fly(sim)
     assert n_seldom < len(searches) - 100
     assert max(rows[0] for rows in every[2::3]) > 0  # they do touch

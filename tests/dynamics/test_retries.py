@@ -14,11 +14,13 @@ import pytest
 
 import taisoft as ts
 from taisoft.dynamics import implicit_stages
-from taisoft.dynamics.contact import BLOCKED, FREE, MAX_PASSAGES, MET, ContactStep
+from taisoft.dynamics.contact import ContactStep
 from taisoft.dynamics.contact_measures import ContactMeasures
 from taisoft.dynamics.contact_paths import ContactPaths
+from taisoft.dynamics.contact_search import ContactSearch
 from taisoft.dynamics.implicit import ImplicitStepper
 from taisoft.dynamics.newton_budget import NewtonBudget
+from taisoft.dynamics.part_check import BLOCKED, FREE, MAX_PASSAGES, MET, PartCheck
 from taisoft.dynamics.part_length import PARTS, PartLength
 from tests.dynamics.contact_scenes import ground, material
 from tests.dynamics.scenes import dynamics
@@ -109,14 +111,14 @@ def test_a_step_ends_at_its_bound_of_iterations(sim, monkeypatch, limit):
 
 def patch_ways(patch, ways: list[int]) -> list:
     """Let the next ways be these, and those after them free. Return the lengths of the parts whose ways are certified."""
-    calls, certify = [], ContactStep.certify
+    calls, certify = [], PartCheck.certify
 
-    def patched(contact, time, dt, start):
+    def patched(check, time, dt, start):
         calls.append(dt)
-        certify(contact, time, dt, start)
+        certify(check, time, dt, start)
         return ways[len(calls) - 1] if len(calls) <= len(ways) else FREE
 
-    patch.setattr(ContactStep, "certify", patched)
+    patch.setattr(PartCheck, "certify", patched)
 
     return calls
 
@@ -132,17 +134,16 @@ def test_a_step_whose_way_is_blocked_is_halved(sim, monkeypatch):
 @by("contacts")
 @pytest.mark.parametrize("measure, depth", [("relative_penetration", 1.0), ("crossing", 3e-3)])
 def test_where_surfaces_cross_a_part_that_leads_deeper_is_halved(sim, monkeypatch, measure, depth):
-    calls, end = [], ContactStep.end
+    calls, end = [], PartCheck.end
 
-    def too_deep_once(contact, time, dt):
+    def too_deep_once(check, time, dt):
         calls.append((time, dt))
-        found = end(contact, time, dt)
-        setattr(contact, measure, depth if len(calls) == 1 else getattr(contact, measure))
-        return found
+        end(check, time, dt)
+        setattr(check, measure, depth if len(calls) == 1 else getattr(check, measure))
 
     def begin():
         monkeypatch.setattr(ContactPaths, "none_cross", property(lambda self: False))
-        monkeypatch.setattr(ContactStep, "end", too_deep_once)
+        monkeypatch.setattr(PartCheck, "end", too_deep_once)
 
     check_retry(sim, begin)
     assert calls[0] == (DT, DT) and {dt for _, dt in calls[1:-1]} == {DT / 2} and calls[-1] == (DT, DT)
@@ -153,17 +154,17 @@ def test_where_surfaces_cross_unknown_contacts_are_met(sim, monkeypatch):
     """And a way that closes too fast even in the shortest part is refused."""
     monkeypatch.setattr(ContactPaths, "none_cross", property(lambda self: False))
     monkeypatch.setattr(ContactPaths, "leaves", lambda self, deviation: True)
-    features, found = ContactStep.found_features, []
+    features, found = ContactSearch.found_features, []
 
-    def unknown_at_first(contact):
-        found.append(features(contact) | ({("unknown",)} if len(found) == 1 else set()))
+    def unknown_at_first(search):
+        found.append(features(search) | ({("unknown",)} if len(found) == 1 else set()))
         return found[-1]
 
     with monkeypatch.context() as patch:
-        patch.setattr(ContactStep, "found_features", unknown_at_first)
+        patch.setattr(ContactSearch, "found_features", unknown_at_first)
         report = sim.step()
     assert report.converged and report.substeps == 1 and len(found) == 4  # twice before and after the search of the way
-    monkeypatch.setattr(ContactStep, "MAX_CLOSING_RATIO", -1.0)
+    monkeypatch.setattr(PartCheck, "MAX_CLOSING_RATIO", -1.0)
     monkeypatch.setattr(ContactMeasures, "describe_fast_closing", lambda self, dt, parts: f"too fast for {dt} in {parts}")
     x = sim.positions()
     with pytest.raises(ts.SimulationError, match=f"^step 2: too fast for {DT} in {PARTS}$"):
@@ -194,7 +195,7 @@ def test_what_a_way_meets_becomes_a_contact_of_the_same_part(sim, monkeypatch):
 def test_what_stays_blocked_is_held_back_and_reported(sim, monkeypatch):
     held = []
     monkeypatch.setattr(ContactPaths, "hold_back", lambda self, x_start: held.append(sim.time) or True)
-    monkeypatch.setattr(ContactStep, "certify", lambda *_: BLOCKED)
+    monkeypatch.setattr(PartCheck, "certify", lambda *_: BLOCKED)
     report = sim.step()
     assert not report.converged and report.substeps == len(held) == PARTS
 

@@ -12,7 +12,7 @@ import pytest
 import taisoft as ts
 from taisoft.backend.paths import gpu_path
 from taisoft.collision.detector import Detection
-from taisoft.dynamics import contact
+from taisoft.dynamics import search_ahead
 from taisoft.dynamics.explicit_batch import NOT_FREE, NOTHING, OUTDATED, Batch
 from tests.dynamics.scenes import dynamics
 
@@ -73,7 +73,7 @@ def paths(speed: float, integrator: str, part: int) -> tuple[np.ndarray, float]:
 def test_results_are_those_of_a_search_in_each_substep(integrator, searches, monkeypatch):
     kept, energy = paths(0.5, integrator, 1)
     few = len(searches)
-    monkeypatch.setattr(contact, "MOST", 1)
+    monkeypatch.setattr(search_ahead, "MOST", 1)
     plain, plain_energy = paths(0.5, integrator, 1)
     assert 3 * few < len(searches) - few
     assert np.abs(kept - plain).max() < 4e-3 * EDGE

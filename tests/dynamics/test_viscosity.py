@@ -10,9 +10,9 @@ import pytest
 
 import taisoft as ts
 from taisoft.dynamics import explicit, implicit_stages
-from taisoft.dynamics.contact import BLOCKED, MET
 from taisoft.dynamics.contact_paths import ContactPaths
 from taisoft.dynamics.dynamics import Dynamics
+from taisoft.dynamics.part_check import BLOCKED, MET
 from taisoft.dynamics.part_length import PartLength
 from taisoft.dynamics.schemes import INTEGRATORS, SECOND_ORDER
 from tests.dynamics.scenes import cube, dynamics, rubber, set_state, use_threads

@@ -14,7 +14,7 @@ import pytest
 
 import taisoft as ts
 from taisoft.checkpoint import read_checkpoint
-from taisoft.dynamics.contact import ContactStep
+from taisoft.dynamics.contact_search import ContactSearch
 from taisoft.dynamics.newton_budget import NewtonBudget
 from tests.collision.detection_scenes import folded
 from tests.collision.rotations import rotation
@@ -194,10 +194,10 @@ def test_runs_are_the_same_and_continue_bitwise_while_passages_are_held(tmp_path
 
 def test_bodies_without_impulses_are_held_back(monkeypatch):
     """No contact has an effect; the step says so. With contacts, the next steps part the bodies."""
-    search, steps = ContactStep.search, 4
+    find, steps = ContactSearch.find, 4
     with ts.Simulator(boxes(), dt=1 / 60) as sim:
         with monkeypatch.context() as without:
-            without.setattr(ContactStep, "search", lambda contact, *at: 0 * search(contact, *at))
+            without.setattr(ContactSearch, "find", lambda search, *at: 0 * find(search, *at))
             reports = judged(sim, steps)
         assert len(reports) == sim.step_count == steps and np.isfinite(sim.velocities()).all()
         texts = [" ".join(r.problems) for r in reports]

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import taisoft as ts
-from taisoft.dynamics.contact import BLOCKED, ContactStep
+from taisoft.dynamics.part_check import BLOCKED, PartCheck
 from taisoft.fem.reference import consistent_mass, gravity_mass, lumped_mass, shape_gradients
 
 G, MU, SPEED, SIDE = 9.81, 0.3, 0.4, 0.1
@@ -69,7 +69,7 @@ def test_forces_torques_and_slip_of_pairs(sim, monkeypatch):
         sim.slip_velocity("sledge")
     if not sim.settings.explicit:
         check_closed_forms(sim)
-        monkeypatch.setattr(ContactStep, "certify", lambda *_: monkeypatch.undo() or BLOCKED)
+        monkeypatch.setattr(PartCheck, "certify", lambda *_: monkeypatch.undo() or BLOCKED)
         assert sim.step().substeps > 1 and sim.contacts().duration < sim.dt
         check_closed_forms(sim)
 
