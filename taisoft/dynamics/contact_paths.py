@@ -79,7 +79,7 @@ class ContactPaths:
         find_displacement(self._simulation.model, self._detection.surface, x_start, self.displacement)
 
     def find_unless_left(self, x_start) -> tuple[bool, bool]:
-        """Return whether the surface left the searched path since x_start, and else what `find` returns; as `keep_path`."""
+        """Keep the path from x_start, see `keep_path`. Return whether it left what was searched, and else what `find` returns."""
         model, paths = self._simulation.model, self._detection.paths
         self.keep_path(x_start)
         if model.on_cpu:
