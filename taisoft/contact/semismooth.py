@@ -2,9 +2,9 @@
 
 A root of F(r) = r - prox(r - f (W r + b)) is sought with a derivative of prox, in which the friction disk's radius follows the
 normal impulse. Redundant contacts, whose W is singular, are separated by a shift. Steps are full: |F| may have to rise before
-the contacts that slip, stick and separate are found. Where it rises for long, a larger shift continues from the smallest |F|. The
-shifts were chosen on 813 problems of four scenes: steps that were shortened until |F| fell failed in 181, full ones with the
-first shift in 25, with all three in 3.
+the contacts that slip, stick and separate are found. Where it rises for long, a larger shift begins anew. The shifts were
+chosen on 813 problems of four scenes: steps that were shortened until |F| fell failed in 181, full ones with the first shift in
+25, with all three in 3.
 Source: Alart and Curnier, "A mixed formulation for frictional contact problems prone to Newton like solution methods", CMAME 92,
 1991. Weakness: far from the solution it may cycle.
 """
@@ -34,9 +34,9 @@ def solve(
     W: (3k,3k); r: (k,3), the start; b: (3k,); friction: (k,); factor: (k,2), f. near: |F| over |r| below which r may hold.
     """
     k, f = len(friction), factor[:, [0, 1, 1]]
-    scaled, best, least, n = (f.reshape(-1, 1) * W).reshape(k, 3, 3 * k), r, np.inf, 0
+    scaled, start, n = (f.reshape(-1, 1) * W).reshape(k, 3, 3 * k), r, 0
     for shift in SHIFTS:
-        r, lowest, n_rising = best, np.inf, 0
+        r, lowest, n_rising = start, np.inf, 0
         for _ in range(most + 1):
             z = r - f * (W @ r.reshape(-1) + b).reshape(-1, 3)
             F = r - prox(z, friction)
@@ -46,8 +46,6 @@ def solve(
                 return admissible, n
             n_rising = 0 if size < lowest else n_rising + 1
             lowest = min(size, lowest)
-            if size < least:
-                best, least = r, size
             if n_rising == MAX_RISING or not np.isfinite(size):
                 break
             try:

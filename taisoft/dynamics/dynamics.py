@@ -146,6 +146,7 @@ class Dynamics:
         """Take a step, launch what later ones may need besides, and return to the present state: see `Simulator.warm_up`."""
         kept, before = self.snapshot(), self._velocities_before
         try:
+            self.stepper.wake()
             self.advance(1)
             self.stepper.warm_up(self.state.time, self.dt)
         finally:

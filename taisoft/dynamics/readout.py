@@ -65,7 +65,10 @@ def rows_of(rows: dict[str, np.ndarray], impulse_fraction: float, sides: tuple |
 
 def join_sides(*found: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     """Return nodes and weights (k, 2 w) of all contacts, from those of several lists whose w may differ."""
-    joined, width = [], max(nodes.shape[1] // 2 for nodes, _ in found)
+    widths = {nodes.shape[1] for nodes, _ in found}
+    if len(widths) == 1:
+        return tuple(np.concatenate(parts) for parts in zip(*found))
+    joined, width = [], max(widths) // 2
     for parts, none in zip(zip(*found), (-1, 0)):
         parts = [part.reshape(len(part), 2, part.shape[1] // 2) for part in parts]
         parts = [np.pad(part, ((0, 0), (0, 0), (0, width - part.shape[2])), constant_values=none) for part in parts]
