@@ -181,10 +181,10 @@ def _compare_with_listed(s: ti.template(), g: ti.template(), limit):
 def is_unfolded(s: ti.template(), g: ti.template(), i, floor):
     """1 if no row of `adjacent` around vertex i is a passage, since its triangles lie spread out; known without looking at rows.
 
-    Seen along n, they go round i once, each turned the same way. What joins the two sides of a row then leaves one triangle, or
-    the sector behind it, and crosses or reaches another one, or meets i: it is no shorter than their least altitude. If that
-    exceeds twice the floor and twice the motion relative to i, the plane across the shortest connection separates the sides at
-    the first advance of `free_until`; a twentieth is left for rounding.
+    Seen along n, which may be any direction, they go round i once, each turned the same way. What joins the two sides of a row
+    then leaves one triangle, or the sector behind it, and crosses or reaches another one, or meets i: it is no shorter than
+    their least altitude. If that exceeds twice the floor and twice the motion relative to i, the plane across the shortest
+    connection separates the sides at the first advance of `free_until`; a twentieth is left for rounding.
     """
     x, n, turns, least, moved = s.x[i], dvec(0.0), 0, ti.cast(ti.math.inf, ti.f64), ti.cast(0.0, ti.f64)
     for r in range(s.ring_start[i], s.ring_start[i + 1]):

@@ -50,9 +50,11 @@ NO_PASSAGES = HeldPassages.at_start(np.zeros((0, 4), dtype=np.int32))
 
 
 def adjacent_rows(triangle: np.ndarray) -> np.ndarray:
-    """Return the vertices (k,6) of what must not pass each other among triangles (n,3) with common vertices: the edge of one
-    opposite the common vertex and the other; if an edge is common, the opposite corners and the sides between them. Then (k,7)
-    with a common vertex."""
+    """Return (k,7): six vertices of what must not pass each other among triangles (n,3) with common vertices, and one of these.
+
+    It is the edge of one triangle opposite the common vertex, and the other one; if an edge is common, the opposite corners and
+    the sides between them.
+    """
     t = np.asarray(triangle, dtype=np.int64)
     corner_of = t.reshape(-1)
     order = np.argsort(corner_of, kind="stable")

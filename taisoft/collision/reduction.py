@@ -226,7 +226,7 @@ def inverse_cell(tolerance: float, cell: float) -> float:
 
 
 class Reduction:
-    """The reduction of one buffer of contacts, whose workspace grows with it. tolerance; cell: edge of the cells [m]."""
+    """The reduction of one buffer of contacts, whose workspace grows with it. tolerance [m]; cell [m]: edge of the cells."""
 
     n_found = n_kept = 0  # contacts before and after it
 
