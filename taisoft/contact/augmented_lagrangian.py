@@ -11,6 +11,7 @@ The problem is that of `problem`, in NumPy, with impulses r (k,3).
 Sources: Alart and Curnier 1991 for the laws as a prox and their derivative; Rockafellar 1976 for the outer iteration.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -98,15 +99,22 @@ class _Island:
 
 
 def solve(
-    W: sp.csr_matrix, b: np.ndarray, friction: np.ndarray, r: np.ndarray, tolerance: float, max_iterations: int
+    W: sp.csr_matrix,
+    b: np.ndarray,
+    friction: np.ndarray,
+    r: np.ndarray,
+    tolerance: float,
+    max_iterations: int,
+    is_over: Callable[[], bool] = lambda: False,
 ) -> tuple[np.ndarray, list[float]]:
     """Return impulses (k,3), starting from r (k,3), and the residual at the start and after each outer iteration.
 
     W: (3k,3k), may be singular and slightly unsymmetric; b: (3k,). tolerance: bound on the residual.
+    is_over: whether to end before the next iteration.
     """
     islands = _islands(W, b, friction, prox(r, friction))
     history = [_residual(islands)]
-    while history[-1] > tolerance and len(history) <= max_iterations:
+    while history[-1] > tolerance and len(history) <= max_iterations and not is_over():
         size = sum(i.size**2 for i in islands)
         for island in islands:
             # if every island is below this, their sum is below the tolerance

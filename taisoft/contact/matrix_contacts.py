@@ -1,6 +1,7 @@
 """Contact problems of a step as matrices: J, and the solution for a W assembled on the host, in fields that are kept."""
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 import scipy.sparse as sp
@@ -36,12 +37,14 @@ class MatrixContacts:
         outer: int = OUTER,
         factor: np.ndarray | None = None,
         limit: float = math.inf,
+        is_over: Callable[[], bool] = lambda: False,
     ) -> tuple[np.ndarray, SolveResult]:
         """Return impulses (k,3), from the start r (k,3), and the result: by Newton's method if W is an array, else by sweeps, and
         by an augmented Lagrangian where these fail.
 
         W: (3k,3k); b: (3k,); friction: (k,); method, tolerance, sweeps: as in `contact.solve.solve`; outer: maximum iterations of
-        the augmented Lagrangian. factor, limit: other r-factors (k,2), and a bound on the residual with these.
+        the augmented Lagrangian; is_over: whether to end it before the next one. factor, limit: other r-factors (k,2), and a
+        bound on the residual with these.
         """
         own = augmented_lagrangian.find_factors(W)
 
@@ -65,7 +68,7 @@ class MatrixContacts:
                 result = solve(p, method, goal, sweeps)
                 r, iterations = p.r.to_numpy(len(friction)), iterations + result.iterations
             if result is None or not result.converged:
-                r, history = augmented_lagrangian.solve(sp.csr_matrix(W), b, friction, r, goal, outer)
+                r, history = augmented_lagrangian.solve(sp.csr_matrix(W), b, friction, r, goal, outer, is_over)
                 result = SolveResult(len(history) - 1, history[-1], history[-1] <= goal)
                 iterations += result.iterations
             reached, other = residuals(r)

@@ -11,6 +11,7 @@ Weakness: W is dense within each part of A: only stages with few contacts a body
 """
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -141,13 +142,21 @@ class DirectSolver:
         self._factor.fronts.factorise(values)
 
     def solve(
-        self, stage_contacts: StageContacts, beta: float, tolerance: float, acceptable: float, with_residual: bool, aim: float
+        self,
+        stage_contacts: StageContacts,
+        beta: float,
+        tolerance: float,
+        acceptable: float,
+        with_residual: bool,
+        aim: float,
+        is_over: Callable[[], bool],
     ) -> tuple[int, bool, float] | None:
         """Move a linearised stage, whose matrix is prepared, to its solution; return (iterations, converged, |r|).
 
         W is that of contacts that press or close, with those that the solution would close, until there are none. tolerance: of
         the laws' residual. acceptable: that residual above which a result is rejected, the state kept, and None returned.
         with_residual: whether to measure |r|, which is rounding; else it is 0. aim: at what residual of the laws W is solved.
+        is_over: whether the augmented Lagrangian, which may take 0.3 s, is to end where it is; not that of rigid bodies.
         """
         m, k, w, delassus = self._model, stage_contacts, self._delassus.unknowns, self._delassus
         p, n = k.problem, int(k.problem.count[0])
@@ -163,9 +172,10 @@ class DirectSolver:
                 b = start[own].reshape(-1)
                 for part in delassus.parts:
                     b[part.rows] += part.Y.T @ without[part.unknowns]
+                over = () if self.is_rigid else (is_over,)
                 limits = self.FRACTION * aim, self.SWEEPS, self._outer, factor[own], self.MET * aim
                 given_W = delassus.matrix(self.DENSE_ROWS), b, friction[own]
-                impulses[own], result = self._contacts.solve(*given_W, r[own], "gauss_seidel", *limits)
+                impulses[own], result = self._contacts.solve(*given_W, r[own], "gauss_seidel", *limits, *over)
                 iterations += result.iterations
                 for part in delassus.parts:
                     w.factor.rhs.host[part.unknowns] += part.Y @ impulses[own].reshape(-1)[part.rows]

@@ -3,7 +3,8 @@
 Iterations of rejected parts count, and of impacts; a linear solve of a linearised contact problem counts as one. At either bound
 Newton's method stops where it is and nothing is tried again. Out of iterations, the rest of the step is held back; out of time,
 it is taken as one part, whose Newton's method and impact have one iteration each, see `implicit`. The time is looked at after
-each iteration and between the linear solves of a frictional problem. What a step reaches in it depends on the machine.
+each iteration and between the linear solves of a frictional problem, or iterations of its augmented Lagrangian. What a step
+reaches in it depends on the machine.
 
 MAX_ITERATIONS is about twice the most that a converged step was found to take: 1,193 in case R1 of `taisoft bench hard`
 (`most_newton_iterations` in its records), 673 in `taisoft bench ipc`, 872 in heap 053, one of the slowest of `taisoft bench

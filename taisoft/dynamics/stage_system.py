@@ -507,9 +507,10 @@ class StageSystem:
             return None
         found, most = None, max(tolerance, self.contact_residual)
         aim = min(tolerance, self.stage.contact_tolerance)  # which costs little more than a loose one, and saves a solve
+        how = self.stage.linearised, aim, self.budget.is_out_of_time
         with one_thread():
             if is_prepared := direct.prepare(self.contacts):
-                found = direct.solve(self.contacts, self.stage.beta, tolerance, most, self.stage.linearised, aim)
+                found = direct.solve(self.contacts, self.stage.beta, tolerance, most, *how)
         self._rejects_direct = found is None and (after or not is_prepared)
         return found
 

@@ -14,10 +14,12 @@ import numpy as np
 import pytest
 
 import taisoft as ts
+from taisoft.contact import augmented_lagrangian, semismooth
 from taisoft.dynamics.direct import DirectSolver
 from taisoft.dynamics.dynamics import Dynamics
 from taisoft.dynamics.friction import Goal, Solution
 from taisoft.dynamics.frictional_problems import FrictionalProblems
+from taisoft.dynamics.newton_budget import NewtonBudget
 from taisoft.dynamics.renewal import Renewal
 from taisoft.dynamics.schemes import SCHEMES
 from taisoft.dynamics.stage import Stage
@@ -202,3 +204,16 @@ def test_runs_are_repeated_bitwise(tmp_path):
         assert np.array_equal([sim.positions(), sim.velocities()], first)
         assert [sim.advance(1) for _ in range(3)] == reports[3:] and len(found) == n_found - n_before
         assert np.array_equal([sim.positions(), sim.velocities()], last)
+
+
+@pytest.mark.parametrize("is_late", [False, True])
+def test_the_augmented_lagrangian_ends_with_the_time_of_a_step(soft, monkeypatch, is_late):
+    """Where Newton's method on W fails; iterations go on then, and end as the rest of the step."""
+    counts, solve = [], augmented_lagrangian.solve
+    monkeypatch.setattr(semismooth, "solve", lambda *given: None)
+    monkeypatch.setattr(augmented_lagrangian, "solve", lambda *given: counts.append((found := solve(*given))[1]) or found)
+    monkeypatch.setattr(soft.state, "budget", 1e3)
+    monkeypatch.setattr(NewtonBudget, "is_out_of_time", lambda self: is_late)
+    with direct():
+        run(soft, 3)
+    assert counts and all((len(history) == 1) == is_late for history in counts if history[0] > 1e-8)
