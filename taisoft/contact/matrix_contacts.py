@@ -72,10 +72,11 @@ class MatrixContacts:
                 result = SolveResult(len(history) - 1, history[-1], history[-1] <= goal)
                 iterations += result.iterations
             reached, other = residuals(r)
-            if not result.converged or holds(r):
+            is_met = reached <= tolerance and other <= limit
+            if is_met or not result.converged:
                 break
             goal = 0.5 * reached * (limit / other if other > limit else 1.0)
-        return r, SolveResult(iterations, reached, holds(r))
+        return r, SolveResult(iterations, reached, is_met)
 
     def _store(self, W: sp.bsr_matrix, b: np.ndarray, friction: np.ndarray, method: str) -> ContactProblem:
         """Return the problem in fields."""

@@ -8,8 +8,7 @@ window, and the window for a step only a moment, while a body is dragged.
 
 So that it keeps up, an implicit step gets a budget of wall time (`Simulator.budget`): SHARE of the dt / speed in which it is due,
 DRAG_SHARE while a body is dragged, less what a state sent after it takes, but at least LEAST_SHARE. Single steps have none, nor
-have those as fast as possible and those after the user has switched it off; one that the simulator has of its own
-counts instead.
+have those as fast as possible and those after the user has switched it off; one that the simulator has of its own counts instead.
 """
 
 import math
